@@ -263,7 +263,7 @@ def models(root: Path) -> list[str]:
 
 SIZES = (
     ("scene.h5", "Mpx of the working grid", "scene.h5:elevation"),
-    ("crops.h5", "pair", "crops.h5:elevation"),
+    ("crops.h5", "", ""),
     ("pairs.h5", "pair", "pairs.h5:elevation"),
     ("checkpoint_0.h5", "", ""),
     ("svbrdf.h5", "Mpx", "svbrdf.h5:elevation"),

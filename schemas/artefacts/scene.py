@@ -12,7 +12,6 @@ from schemas.artefacts.common import (
     SMALLEST_GSD,
     VALIDITY,
     column,
-    crop_map,
     grid_map,
 )
 from schemas.declaration import Attribute, Schema, Variable, declare
@@ -77,13 +76,14 @@ SCENE = declare(
 CROPS = declare(
     Schema(
         name="crops",
-        version=1,
+        version=2,
         stage="sample",
-        title="Crop centres and DEM crops with a geographic split",
-        dims={"pair": "one crop of one image", "y": "crop rows", "x": "crop columns", "frame": "source images"},
-        variables=(crop_map("elevation", "f4", "m", "height above the reference sphere"),) + PAIR_PLACE + FRAME_TABLE,
+        title="Crop centres with a geographic split; the scene holds their elevations",
+        dims={"pair": "one crop of one image", "frame": "source images"},
+        variables=PAIR_PLACE + FRAME_TABLE,
         attributes=PLACE
         + (
+            Attribute("crop_px", "edge of a crop, px", True, "integer", 2, LARGEST_COUNT),
             Attribute("scene", "the scene artefact, relative to this file"),
             Attribute("scene_sha256", "its SHA-256"),
             Attribute("tile_m", "edge of a ground tile, m", True, "number", SMALLEST_GSD, LARGEST_COUNT),

@@ -54,17 +54,18 @@ def check_sources(crops: Path, frames: list[Frame]) -> None:
 
 
 def check_places(crops: Path, file: h5py.File, shape: tuple[int, int]) -> None:
-    """Refuse crops that are not square, of an even size, and on the scene. Raises ArtefactError."""
-    height, width = file["elevation"].shape[1:]
-    if height != width or height % 2:
+    """Refuse crops that are not of an even size, and on the scene. Raises ArtefactError."""
+    size = int(file.attrs["crop_px"])
+    half = size // 2
+    if size % 2:
         raise ArtefactError(
-            f"{crops}:/elevation: expected square crops of an even size, found {height} x {width}; run 'lunargr sample' again."
+            f"{crops}: root attribute 'crop_px': expected an even size, found {size}; run 'lunargr sample' again."
         )
     for name, edge in zip(("row", "col"), shape, strict=True):
         centre = file[name][...].astype(np.int64)
-        if len(centre) and (centre.min() < height // 2 or centre.max() > edge - height // 2):
+        if len(centre) and (centre.min() < half or centre.max() > edge - half):
             raise ArtefactError(
-                f"{crops}:/{name}: expected crops that lie on the scene, {height // 2} .. {edge - height // 2}, "
+                f"{crops}:/{name}: expected crops that lie on the scene, {half} .. {edge - half}, "
                 f"found {centre.min()} .. {centre.max()}; run 'lunargr sample' again."
             )
 

@@ -25,7 +25,7 @@ def register(frame: Frame, index: int, source: Source, crops: h5py.File, scene: 
 
     began = time.monotonic()
     mine = crops["image_index"][...] == index
-    size = crops["elevation"].shape[1]
+    size = int(crops.attrs["crop_px"])
     blocks = choose_blocks(crops["row"][...][mine], crops["col"][...][mine], size, scene.grid)
     field, shifts = register_frame(frame, source, scene, blocks, str(config.register), config.max_shift)
     places = [(r + (h - 1) / 2, c + (w - 1) / 2) for r, c, h, w in blocks]
@@ -67,7 +67,7 @@ def resemble(
 
     mine = crops["image_index"][...] == index
     rows, cols = (crops[name][...][mine] for name in ("row", "col"))
-    blocks = choose_blocks(rows, cols, crops["elevation"].shape[1], scene.grid, BLOCKS)
+    blocks = choose_blocks(rows, cols, int(crops.attrs["crop_px"]), scene.grid, BLOCKS)
     return compare_with_rendering(frame, source, scene, blocks, field)
 
 

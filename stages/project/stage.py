@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -38,8 +39,7 @@ def work(crops: Path, output: Output, config: Config, progress: Progress) -> Sum
     with open_artefact(crops, CROPS) as file, open_scene(crops, file, config) as scene:
         frames = load_frames(file, crops)
         check_distinct(frames)
-        total, size = file["elevation"].shape[:2]
-        part = slice(*shard_range(total, config.shard))
+        size, part = int(file.attrs["crop_px"]), slice(*shard_range(len(file["row"]), config.shard))
         check_sources(crops, [frames[k] for k in sorted({int(k) for k in file["image_index"][part]})])
         check_places(crops, file, scene.elevation.shape)
         units = _units(crops, file, frames)
@@ -52,7 +52,7 @@ def work(crops: Path, output: Output, config: Config, progress: Progress) -> Sum
             seed=int(file.attrs["seed"]),
             attributes={"gsd_m": scene.grid.gsd, "body_radius_m": scene.grid.radius},
         ) as writer:
-            summary = _project(writer, Crops(file, part), scene, frames, units, config, progress)
+            summary = _project(writer, Crops(file, part, scene.elevation), scene, frames, units, config, progress)
             if output.shifts is not None:
                 write_shifts(output.shifts, summary.registered)
             return summary
@@ -70,10 +70,11 @@ def in_parts(job: Job, crops: Path, config: Config) -> Summary:
 
 @dataclass(frozen=True)
 class Crops:
-    """The crops of one shard. part : its rows of crops.h5"""
+    """The crops of one shard. part : its rows of crops.h5; terrain : the scene's elevations, (H, W) m"""
 
     file: h5py.File
     part: slice
+    terrain: Any
 
     def column(self, name: str) -> NDArray:
         """(n,) values of one variable."""
@@ -81,12 +82,13 @@ class Crops:
 
     def elevation(self, k: int) -> NDArray[np.float32]:
         """(size, size) m. Crop by crop: an image may have more of them than fit into memory."""
-        return np.asarray(self.file["elevation"][self.part.start + k])
+        row, col = (int(self.file[name][self.part.start + k]) - self.size // 2 for name in ("row", "col"))
+        return np.asarray(self.terrain[row : row + self.size, col : col + self.size])
 
     @property
     def size(self) -> int:
         """px, of a crop's side"""
-        return int(self.file["elevation"].shape[1])
+        return int(self.file.attrs["crop_px"])
 
 
 @dataclass(frozen=True)

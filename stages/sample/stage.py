@@ -41,7 +41,6 @@ class Scene:
     """An open scene, and the edge of the crops, px."""
 
     path: Path
-    file: h5py.File
     grid: Grid
     frames: list[Frame]
     crop: int
@@ -63,7 +62,7 @@ def work(scene: Path, output: Output, config: Config, progress: Progress) -> lis
                 f"{scene}: no crop of {crop} px fits into a tile of {edge * grid.gsd:g} m and valid data; choose a smaller `crop` or other `tile_m`."
             )
         parts = audit(chosen, tiles, grid, crop)
-        _write(opened, output, chosen, tiles, parts, config, progress)
+        _write(opened, output, chosen, tiles, parts, config)
     return parts
 
 
@@ -98,7 +97,7 @@ def _read(path: Path, file: h5py.File, config: Config) -> Scene:
         )
     if not frames:
         raise ConfigError(f"{path}: expected images, found none; run 'lunargr ingest' with `images`.")
-    return Scene(path, file, grid, frames, crop)
+    return Scene(path, grid, frames, crop)
 
 
 def _write(
@@ -108,14 +107,14 @@ def _write(
     tiles: Tiles,
     audited: list[Part],
     config: Config,
-    progress: Progress,
 ) -> None:
     """The crops of this shard. chosen : the centres of all shards"""
-    grid, crop, half = scene.grid, scene.crop, scene.crop // 2
+    grid, crop = scene.grid, scene.crop
     mine = chosen[slice(*shard_range(len(chosen), config.shard))]
     attributes = {
         "gsd_m": grid.gsd,
         "body_radius_m": grid.radius,
+        "crop_px": np.int32(crop),
         "scene": relative_path(scene.path, output.file.resolve().parent),
         "scene_sha256": sha256(scene.path),
         "tile_m": tiles.edge * grid.gsd,
@@ -125,18 +124,12 @@ def _write(
     with ArtefactWriter(
         output.file,
         CROPS,
-        {"pair": len(mine), "y": crop, "x": crop, "frame": len(scene.frames)},
+        {"pair": len(mine), "frame": len(scene.frames)},
         config=asdict(config) | {"crop": crop} | tiles.identity(bounds_deg(grid)),
         inputs=[scene.path],
         seed=config.seed,
         attributes=attributes,
     ) as writer:
-        elevation, source = writer.dataset("elevation"), scene.file["elevation"]
-        for k, (r, c) in enumerate(zip(mine["row"], mine["col"], strict=True)):
-            if k % 100 == 0:
-                progress(k, len(mine), "crops")
-            elevation[k] = source[r - half : r + half, c - half : c + half]
-        progress(len(mine), len(mine), "crops")
         # The centre of an even crop is the corner shared by its four middle pixels.
         lon, lat = grid.lonlat(mine["row"] - 0.5, mine["col"] - 0.5)
         writer.write("longitude_deg", lon)

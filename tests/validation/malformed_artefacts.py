@@ -203,7 +203,7 @@ def _links(kind: str) -> Iterator[tuple[str, Change]]:
     for v in [v for v in schema.variables if v.required][:8]:
 
         def external(f: h5py.File, name: str = v.name) -> None:
-            f[name] = h5py.ExternalLink("pairs.h5" if kind != "pairs" else "crops.h5", "/elevation")
+            f[name] = h5py.ExternalLink("pairs.h5" if kind != "pairs" else "scene.h5", "/elevation")
 
         def loop(f: h5py.File, name: str = v.name) -> None:
             f[name] = h5py.SoftLink(f"/{name}")
@@ -255,7 +255,7 @@ def _by_hand(kind: str) -> Iterator[tuple[str, Change]]:
         )
         yield "an image that is not there", replace("path", lambda a: np.array([b"nowhere.tif"] * len(a), "S11"))
         yield "crops off the scene", replace("row", lambda a: a + 100_000)
-        yield "crops that are not square", replace("elevation", lambda a: a[:, :, : a.shape[2] // 2])
+        yield "crops of an odd size", attribute("crop_px", np.int32(31))
     if kind == "pairs":
         yield "nothing valid", replace("valid", lambda a: 0 * a)
         yield "images all NaN", replace("image", lambda a: np.nan * a)
