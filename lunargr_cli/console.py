@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING
 
 from lunargr_cli import raise_again
 from lunargr_cli.spelling import spell
+from schemas.command_line import is_first_process
 from schemas.errors import InputError
 
 if TYPE_CHECKING:
@@ -97,7 +98,7 @@ class Console:
     """The messages and progress of one command.
 
     A stage takes ``console.progress`` as a callable ``(done, total, what)``; on a terminal it is a bar that is redrawn,
-    in a log file a line every ten seconds. clock : in seconds
+    in a log file a line every ten seconds. Under torchrun the first process alone speaks. clock : in seconds
     """
 
     quiet: bool = False
@@ -105,6 +106,9 @@ class Console:
     _bars: Progress | None = field(default=None)
     _shown: float | None = field(default=None)
     _drawn: bool = field(default=False)
+
+    def __post_init__(self) -> None:
+        self.quiet |= not is_first_process()
 
     def say(self, message: str) -> None:
         """A line for the person at the terminal."""

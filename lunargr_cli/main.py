@@ -67,7 +67,7 @@ def _as_typed(name: str, command: Callable[..., None]) -> Callable[..., None]:
             made_by = _plain(_command_line()), _plain(_folder())
             with recording(made_by):
                 command(**options)
-            if (step := next_step(name, options)) and os.environ.get("RANK", "0") == "0":
+            if step := next_step(name, options):
                 Console(options.get("quiet", False)).say(f"next: {step}")
         except LunargrError as error:
             raise type(error)(spell(str(error))) from None

@@ -36,6 +36,11 @@ def count_processes() -> tuple[int, int]:
     return counts[0], min(counts)
 
 
+def is_first_process() -> bool:
+    """Whether this is the process that writes and speaks: under torchrun the first one, otherwise any."""
+    return os.environ.get("RANK", "0") == "0"
+
+
 def output_of(words: Sequence[str]) -> str | None:
     """The output that the words of a command line name, None where they leave it to the command."""
     for word, following in zip(words, [*words[1:], ""], strict=True):

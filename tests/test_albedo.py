@@ -31,7 +31,7 @@ def read(path, *names):
 def made(planted, config=QUIET, name="albedo.h5"):
     """(albedo, std, images) of a planted scene."""
     out = planted.folder / name
-    albedo.run(planted.map, planted.scene, Output(out, overwrite=True), config)
+    albedo.run(planted.map, planted.scene, None, Output(out, overwrite=True), config)
     return read(out, "albedo", "albedo_std", "albedo_images")
 
 
@@ -162,7 +162,7 @@ def deviated(planted, tmp_path_factory):
 def corrected(planted, deviated, tmp_path_factory):
     """Albedo of the map with deviations."""
     out = tmp_path_factory.mktemp("corrected") / "albedo.h5"
-    albedo.run(deviated, planted.scene, out, QUIET)
+    albedo.run(deviated, planted.scene, None, out, QUIET)
     return out
 
 
@@ -216,20 +216,20 @@ def test_shards_and_parts_give_the_same_bytes(planted, tmp_path, monkeypatch):
     config = replace(QUIET, geotiff=True)
     names = ("albedo", "albedo_std", "albedo_images", "coefficients", "elevation", "albedo_gain", "albedo_image_std")
     whole = tmp_path / "whole.h5"
-    albedo.run(planted.map, planted.scene, whole, config)
+    albedo.run(planted.map, planted.scene, None, whole, config)
     parts = [tmp_path / f"part{k}.h5" for k in range(3)]
     for k, part in enumerate(parts):
-        albedo.run(planted.map, planted.scene, part, replace(config, shard=(k, 3)))
+        albedo.run(planted.map, planted.scene, None, part, replace(config, shard=(k, 3)))
     merge.run(parts, tmp_path / "merged.h5")
     # an interrupted run: its calibration and first part are there, the rest is made by the next
     resumed = tmp_path / "resumed.h5"
     with monkeypatch.context() as broken:
         broken.setattr("stages.merge.run", interrupt)
         with pytest.raises(KeyboardInterrupt):
-            albedo.run(planted.map, planted.scene, Output(resumed, resume=True, parts=3), config)
+            albedo.run(planted.map, planted.scene, None, Output(resumed, resume=True, parts=3), config)
     left = sorted((tmp_path / "resumed.h5.parts").rglob("map-*.h5"))
     left[1].unlink()
-    albedo.run(planted.map, planted.scene, Output(resumed, resume=True, parts=3), config)
+    albedo.run(planted.map, planted.scene, None, Output(resumed, resume=True, parts=3), config)
     for other in ("merged", "resumed"):
         for name, a, b in zip(names, read(whole, *names), read(tmp_path / f"{other}.h5", *names), strict=True):
             assert a.tobytes() == b.tobytes(), (other, name)
@@ -262,7 +262,7 @@ def test_held_out_images_are_never_those_that_made_the_albedo(planted, tmp_path)
     project.run(crops, pairs, project.Config())
     folds = [tmp_path / f"fold{k}.h5" for k in range(2)]
     for k, path in enumerate(folds):
-        albedo.run(planted.map, planted.scene, path, replace(QUIET, fold=(k, 2)))
+        albedo.run(planted.map, planted.scene, None, path, replace(QUIET, fold=(k, 2)))
     out = tmp_path / "evaluation.h5"
     code, _ = run_command("held-out", pairs, *folds, "-o", out)
     assert code == 0
@@ -287,7 +287,7 @@ def test_bad_input_is_refused_in_one_line(planted, found, tmp_path):
 
     def refused(error, words, svbrdf=planted.map, scene=planted.scene, output=out, config=QUIET):
         with pytest.raises(error, match=words) as caught:
-            albedo.run(svbrdf, scene, Output(output, overwrite=True), config)
+            albedo.run(svbrdf, scene, None, Output(output, overwrite=True), config)
         assert "\n" not in str(caught.value)
         assert not out.exists()
 
@@ -372,14 +372,14 @@ def test_what_registration_finds_is_taken_off_by_all_shards(rng, tmp_path, monke
     Calibration.read(path, made_from).write(again, made_from)
     assert again.read_bytes() == path.read_bytes()
     monkeypatch.setattr(running, "_calibrate", None)  # shards have no need of it
-    albedo.run_calibrated(scene.map, scene.scene, path, part, config)
+    albedo.run(scene.map, scene.scene, path, part, config)
     np.testing.assert_array_equal(read(part, "albedo")[0], whole)
     with pytest.raises(ArtefactError, match=r"calibration\.json: .* found another \(register\)"):
-        albedo.run_calibrated(scene.map, scene.scene, path, tmp_path / "other.h5", QUIET)
+        albedo.run(scene.map, scene.scene, path, tmp_path / "other.h5", QUIET)
     for text in ("no JSON", "[]", '{"made_from": 1}'):
         path.write_text(text)
         with pytest.raises(ArtefactError, match=r"calibration\.json: expected "):
-            albedo.run_calibrated(scene.map, scene.scene, path, tmp_path / "other.h5", config)
+            albedo.run(scene.map, scene.scene, path, tmp_path / "other.h5", config)
 
 
 def test_an_unknown_form_of_registration_is_refused(planted, tmp_path):

@@ -107,7 +107,7 @@ def test_maps_carry_the_record_to_the_judgement_of_unseen_images(trained, small_
         image = int(np.bincount(reader.frame[clean]).argmax())
         unseen, name = clean[reader.frame[clean] == image], reader.image_ids[image]
     infer.run(small_artefacts["scene"], trained / "checkpoint.h5", svbrdf, infer.Config(device="cpu", geotiff=False))
-    albedo.run(svbrdf, small_artefacts["scene"], fold, albedo.Config(leave_out=(name,), geotiff=False))
+    albedo.run(svbrdf, small_artefacts["scene"], None, fold, albedo.Config(leave_out=(name,), geotiff=False))
     result = evaluate.run_held_out(trained / "pairs.h5", [fold], tmp_path / "e.h5", evaluate.HeldOutConfig())
     assert len(unseen) and result["pairs"] == len(unseen)
     assert result["warnings"] == [notes[0].replace("checkpoint.h5", "fold.h5")]

@@ -7,6 +7,7 @@ import pytest
 import torch
 import torch.distributed as dist
 
+from lunargr_cli.console import Console
 from stages import train
 from stages.pairs.reader import PairReader
 from stages.train.epoch import evaluate_loss, learn_epoch
@@ -33,6 +34,19 @@ def worker(rank, pairs, folder):
     for batch in BATCHES:
         np.savez(f"{folder}/{batch}-{rank}.npz", **learn(pairs, rank, RANKS, batch))
     dist.destroy_process_group()
+
+
+def test_the_first_process_alone_speaks(monkeypatch, capsys):
+    """The others know neither the speed nor the files: they said 'nan pairs/s' of a run that went well."""
+    for rank in ("0", "1"):
+        monkeypatch.setenv("RANK", rank)
+        console = Console()
+        console.say(f"said by {rank}")
+        console.progress(3, 3, f"done by {rank}")
+        console.table(f"table of {rank}", ("a",), [("1",)])
+    shown = capsys.readouterr()
+    assert "said by 0" in shown.err and "table of 0" in shown.out
+    assert "by 1" not in shown.err and "of 1" not in shown.out
 
 
 @pytest.fixture(scope="module")

@@ -64,12 +64,7 @@ def command(
         fitted = albedo.calibrate_to(svbrdf, scene, to, config, console.progress)
         console.say(f"{output}: calibration of {len(fitted.gain)} images")
         return
-    if to.in_parts and calibration:
-        raise ConfigError("--calibration: --scheduler and --resume make their own; give it to --shard alone.")
-    if calibration:
-        summary = albedo.run_calibrated(svbrdf, scene, calibration, to, config, console.progress)
-    else:
-        summary = albedo.run(svbrdf, scene, to, config, console.say, console.progress)
+    summary = albedo.run(svbrdf, scene, calibration, to, config, console.say, console.progress)
     mean, std, low, high = summary.albedo
     console.say(
         f"{output}: albedo from {len(summary.images)} images over {summary.covered_share:.1%} of the map, "

@@ -7,7 +7,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from schemas.files.outputs import Output, map_targets
+from schemas.errors import ConfigError
+from schemas.files.outputs import Output
 from stages.albedo.config import Config, Summary
 from stages.common import runner
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
@@ -15,34 +16,25 @@ from stages.common.progress import Progress, Say, say_nothing, show_nothing
 if TYPE_CHECKING:
     from stages.albedo.calibrate import Calibration
 
-__all__ = ["Config", "Summary", "calibrate_to", "run", "run_calibrated"]
+__all__ = ["Config", "Summary", "calibrate_to", "run"]
 
 
-@runner.stage(writes=lambda call: map_targets(call.output, call.config.as_geotiff), in_parts=True)
+def _check(call: runner.Call) -> None:
+    if call.output.in_parts and call.arguments["calibration"] is not None:
+        raise ConfigError("`calibration`: `scheduler` and `resume` make their own; give it to `shard` alone.")
+
+
+@runner.stage(writes=runner.the_map, check=_check, in_parts=True)
 def run(
     svbrdf: Path,
     scene: Path,
+    calibration: Path | None,
     output: Output | Path,
     config: Config,
     say: Say = say_nothing,
     progress: Progress = show_nothing,
 ) -> Summary:
-    """Write the map with albedo. Raises LunargrError."""
-    from stages.albedo.stage import work
-
-    return work(svbrdf, scene, None, Output.at(output), config, progress)
-
-
-@runner.stage(writes=lambda call: map_targets(call.output, call.config.as_geotiff))
-def run_calibrated(
-    svbrdf: Path,
-    scene: Path,
-    calibration: Path,
-    output: Output | Path,
-    config: Config,
-    progress: Progress = show_nothing,
-) -> Summary:
-    """:func:`run` with the calibration of :func:`calibrate_to`, which all shards share. Raises LunargrError."""
+    """Write the map with albedo. calibration : from :func:`calibrate_to`, which all shards share. Raises LunargrError."""
     from stages.albedo.stage import work
 
     return work(svbrdf, scene, calibration, Output.at(output), config, progress)

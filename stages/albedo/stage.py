@@ -32,6 +32,7 @@ from stages.albedo.writing import Maps, copy_map, kept_attributes
 from stages.common.arrays import Floats32
 from stages.common.progress import Progress
 from stages.common.runner.job import Job
+from stages.common.runner.stage import as_geotiff
 from stages.physics.bodies.spheres import find_body
 from stages.physics.images.references import References, open_references
 from stages.physics.images.registered import register
@@ -76,7 +77,7 @@ def open_ground(svbrdf: Path, scene: Path, config: Config) -> Iterator[Ground]:
 def work(
     svbrdf: Path, scene: Path, calibration: Path | None, output: Output, config: Config, progress: Progress
 ) -> Summary:
-    """See :func:`stages.albedo.run` and :func:`stages.albedo.run_calibrated`."""
+    """See :func:`stages.albedo.run`."""
     with open_ground(svbrdf, scene, config) as ground:
         if calibration:
             found = Calibration.read(calibration, _identity(svbrdf, scene, config))
@@ -111,18 +112,18 @@ def work(
             for block in blocks.within(own, progress):
                 maps.put(block, *work_block(ground, found, block))
             maps.close()
-            if config.as_geotiff:
+            if as_geotiff(config):
                 partial = stack.enter_context(atomic_path(output.geotiff_path))
                 write_geotiff(partial, writer.file, read_grid(writer.file, output.file))
             return _summary(writer.file, config, scene)
 
 
-def in_parts(job: Job, svbrdf: Path, scene: Path, config: Config) -> Summary:
+def in_parts(job: Job, svbrdf: Path, scene: Path, _: None, config: Config) -> Summary:
     """The map: the images' calibration in one part, then shards of the map's rows."""
     files = {"svbrdf": svbrdf, "scene": scene, "config": config}
     [calibration] = job.fan("calibration", write_calibration, [files], ".json")
     bands = _count_bands(svbrdf, scene, config)
-    pieces = job.shards("map", [svbrdf, scene, calibration], config, bands, function="run_calibrated")
+    pieces = job.shards("map", [svbrdf, scene, calibration], config, bands)
     whole = Output(job.output.file, overwrite=True, geotiff=job.output.geotiff)
     merge.run(pieces, whole, merge.Config(inputs=(svbrdf, scene)), progress=job.progress)
     return _summarise(job.output.file, scene)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from schemas.files.outputs import Output, map_targets
+from schemas.files.outputs import Output
 from stages.common import runner
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.infer.config import Config
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 __all__ = ["Config", "run"]
 
 
-@runner.stage(writes=lambda call: map_targets(call.output, call.config.as_geotiff), in_parts=True)
+@runner.stage(writes=runner.the_map, in_parts=True)
 def run(
     scene: Path,
     checkpoint: Path,

@@ -24,6 +24,7 @@ from stages.common.brightness import QUANTITIES
 from stages.common.memory import keep_freed_memory, return_freed_memory
 from stages.common.progress import Progress
 from stages.common.runner.job import Job
+from stages.common.runner.stage import as_geotiff
 from stages.infer.config import Config
 from stages.infer.parallel import run_in_threads
 from stages.infer.terrain import TerrainReader, valid_part
@@ -109,7 +110,7 @@ def work(scene: Path, checkpoint: Path, output: Output, config: Config, progress
                 writer.dataset("coefficients_std")
             mapper = Mapper(predictor, device, precision, torch.get_num_threads(), deviations=bool(maps))
             picture = None
-            if config.as_geotiff:
+            if as_geotiff(config):
                 partial = stack.enter_context(atomic_path(output.geotiff_path))
                 bands = band_names(names, maps)
                 tags = map_tags(bands, writer.file.attrs)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from schemas.files.outputs import Output, map_targets
+from schemas.files.outputs import Output
 from stages.common import runner
 from stages.common.progress import Progress, show_nothing
 from stages.normalize.config import Config, Summary, check
@@ -13,7 +13,7 @@ __all__ = ["Config", "Summary", "run"]
 
 
 @runner.stage(
-    writes=lambda call: map_targets(call.output, call.config.as_geotiff),
+    writes=runner.the_map,
     check=lambda call: check(call.config, call.arguments["svbrdf"] is not None),
 )
 def run(

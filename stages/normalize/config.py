@@ -38,11 +38,6 @@ class Config:
     geotiff: bool = True
     shard: tuple[int, int] = (0, 1)
 
-    @property
-    def as_geotiff(self) -> bool:
-        """Whether a GeoTIFF is written: of a shard, which holds some rows only, it is not."""
-        return self.geotiff and self.shard[1] == 1
-
 
 @dataclass(frozen=True)
 class Summary:

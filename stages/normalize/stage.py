@@ -18,6 +18,7 @@ from schemas import NORMALIZED, SCENE, SVBRDF, ArtefactWriter, ConfigError, Inpu
 from schemas.files.outputs import Output, atomic_path
 from stages.common.arrays import Floats32
 from stages.common.progress import Progress
+from stages.common.runner.stage import as_geotiff
 from stages.normalize.config import Config, Summary
 from stages.normalize.factor import GOOD, UNSEEN, Normaliser, placed
 from stages.normalize.levels import Levels, compare_angles, find_levels, take_samples
@@ -103,7 +104,7 @@ def work(scene: Path, svbrdf: Path | None, output: Output, config: Config, progr
         for box in blocks.within(own, progress):
             maps.put(box, work_block(ground, levels, box))
         maps.close(references, levels, layers)
-        if config.as_geotiff:
+        if as_geotiff(config):
             partial = stack.enter_context(atomic_path(output.geotiff_path))
             write_geotiff(partial, writer.file, references.surface.grid)
         return maps.summarise(references.frames, levels, ground.units, compare_angles(samples, references.frames))

@@ -25,7 +25,7 @@ class Config:
     body: str | None = None
 
 
-@runner.stage(writes=lambda call: map_targets(call.output, call.config.infer.as_geotiff), in_parts=True)
+@runner.stage(writes=lambda call: map_targets(call.output, runner.as_geotiff(call.config.infer)), in_parts=True)
 def run(
     terrain: Path,
     checkpoint: Path,

@@ -10,6 +10,6 @@ and whether it works in parts, is declared beside it:
 
 from __future__ import annotations
 
-from stages.common.runner.stage import Call, prepared, stage
+from stages.common.runner.stage import Call, as_geotiff, prepared, stage, the_map
 
-__all__ = ["Call", "prepared", "stage"]
+__all__ = ["Call", "as_geotiff", "prepared", "stage", "the_map"]

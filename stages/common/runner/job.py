@@ -72,24 +72,21 @@ class Job:
             _await(path)
         return paths
 
-    def shards(
-        self, name: str, inputs: Sequence[Any], config: Any, pieces: int, each: int = 1, function: str = "run"
-    ) -> list[Path]:
+    def shards(self, name: str, inputs: Sequence[Any], config: Any, pieces: int, each: int = 1) -> list[Path]:
         """Have the stage make its shards of these inputs; their paths in order.
 
         pieces : into which the work can be cut; each : how many of them a shard holds where the user says nothing
-        function : of the stage's package that makes them
         """
         count = max(1, min(self.output.parts or math.ceil(pieces / each), pieces))
-        shared = {"package": self.package, "function": function, "inputs": inputs}
+        shared = {"package": self.package, "inputs": inputs}
         return self.fan(
             name, write_shard, [shared | {"config": replace(config, shard=(k, count))} for k in range(count)]
         )
 
 
-def write_shard(path: Path, package: str, function: str, inputs: Sequence[Any], config: Any) -> None:
+def write_shard(path: Path, package: str, inputs: Sequence[Any], config: Any) -> None:
     """Write one shard of what a stage makes of its inputs."""
-    getattr(importlib.import_module(package), function)(*inputs, Output(path, overwrite=True), config)
+    importlib.import_module(package).run(*inputs, Output(path, overwrite=True), config)
     path.with_suffix(".tif").unlink(missing_ok=True)  # the whole gets it: also where one shard is all
 
 

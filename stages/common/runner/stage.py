@@ -6,17 +6,17 @@ import contextlib
 import functools
 import importlib
 import inspect
-import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
+from schemas.command_line import is_first_process
 from schemas.errors import ConfigError
 from schemas.files.companions import companions_of
 from schemas.files.inputs import Inputs, check_input
 from schemas.files.locks import claim
-from schemas.files.outputs import Output, Target, check_apart, check_places, protect, write_json
+from schemas.files.outputs import Output, Target, check_apart, check_places, map_targets, protect, write_json
 
 MOST_WORKERS = 4096  # of one machine
 P = ParamSpec("P")
@@ -62,6 +62,16 @@ def paths_in(values: Iterable[Any]) -> Iterator[Path]:
 def the_output(call: Call) -> list[Target]:
     """The one file of most stages."""
     return [Target(call.output.file)]
+
+
+def as_geotiff(config: Any) -> bool:
+    """Whether a map is written as a GeoTIFF too: a shard, which holds some rows only, is not."""
+    return bool(config.geotiff) and config.shard[1] == 1
+
+
+def the_map(call: Call) -> list[Target]:
+    """The file of a map, and its GeoTIFF where one is written."""
+    return map_targets(call.output, as_geotiff(call.config))
 
 
 def stage(
@@ -128,10 +138,9 @@ def prepared(
     for path in reads:
         check_input(path)
     known = Inputs(reads)
-    first = os.environ.get("RANK", "0") == "0"  # under torchrun the first process alone writes
     beside = main if any(target.path == main for target in writes) else None
     check_apart(writes, known)
-    with protect(known, writes, overwrite), claim(main) if main and first else contextlib.nullcontext():
+    with protect(known, writes, overwrite), claim(main) if main and is_first_process() else contextlib.nullcontext():
         check_places(writes, overwrite)  # after the lock: whoever gets it tidies up after a killed run
         with companions_of(beside):
             yield known
