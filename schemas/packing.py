@@ -80,7 +80,7 @@ def decoder(data: h5py.Dataset) -> Callable[[NDArray], NDArray]:
 
     def decode(values: NDArray) -> NDArray:
         if packed:
-            result = values * scale
+            result: NDArray = values * scale
             result += offset
             result = result.astype(np.float32, copy=False)
         else:

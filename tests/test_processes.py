@@ -43,7 +43,7 @@ def test_the_first_process_alone_speaks(monkeypatch, capsys):
         console = Console()
         console.say(f"said by {rank}")
         console.progress(3, 3, f"done by {rank}")
-        console.table(f"table of {rank}", ("a",), [("1",)])
+        console.table("", (f"table of {rank}",), [("1",)])
     shown = capsys.readouterr()
     assert "said by 0" in shown.err and "table of 0" in shown.out
     assert "by 1" not in shown.err and "of 1" not in shown.out
