@@ -9,6 +9,7 @@ import math
 import cv2
 import numpy as np
 import pytest
+from command import lunargr
 from render_scene import LAT, LON, lunargr_render
 
 from schemas.errors import ConfigError, InputError, RegistryError
@@ -161,3 +162,22 @@ def test_a_map_seen_from_above_has_no_sensor(hilly_map, tmp_path, monkeypatch, c
     arguments = ("--view", "ortho", "--sensor", "mardi", "--sun-azimuth", "100", "--sun-elevation", "35")
     code, error = lunargr_render(monkeypatch, capsys, hilly_map[0], *arguments, "-o", tmp_path / "v.exr", "--quiet")
     assert code == 3 and "--sensor" in error and not list(tmp_path.glob("v*"))
+
+
+@pytest.mark.slow
+def test_diagnose_finds_the_blur_of_a_sensor(tmp_path):
+    """Optics of 1.6 px, in DN, on the way that a user goes."""
+    sensor = {"full_well": 30000, "read_noise": 30, "auto_level": 0.5, "offset_dn": 60, "psf_sigma_px": 1.6}
+    (tmp_path / "sensor.json").write_text(json.dumps(sensor))
+    scene = "simulate -o scene --size-px 700 --images 10 --hidden none --sensor sensor.json --seed 4"
+    for line in (
+        scene,
+        "ingest scene/dem.tif --images scene/images.csv --gsd 5 -o scene.h5",
+        "sample scene.h5 -o crops.h5 --crop 128",
+        "project crops.h5 -o pairs.h5",
+        "diagnose pairs.h5 -o diagnosis.h5 --json answer.json",
+    ):
+        done = lunargr(*line.split(), "--quiet", cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+    answer = json.loads((tmp_path / "answer.json").read_text())
+    assert [cause["effect"] for cause in answer["causes"]] == ["psf_blur"]

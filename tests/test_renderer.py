@@ -81,6 +81,8 @@ def test_a_view_that_cannot_be_is_refused_and_the_next_one_comes(hilly_map, pose
         assert np.isfinite(renderer.view(POSE, SUN).depth).any()
 
 
-def test_a_setting_that_is_none_is_refused(hilly_map):
+def test_a_setting_that_cannot_be_is_refused(hilly_map):
     with pytest.raises(InputError, match="unknown key 'sample', did you mean 'samples'"):
         render.Renderer(hilly_map[0], sample=1)
+    with pytest.raises(ConfigError, match="expected rays per pixel"):
+        render.Renderer(hilly_map[0], samples=0)

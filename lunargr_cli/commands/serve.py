@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Annotated
 
 import typer
@@ -45,5 +46,5 @@ def command(
         write_out(f"{path} at {where}")
         flush_out()  # whoever waits for the line may read it through a pipe
 
-    with Renderer(path, config=config) as renderer:
+    with Renderer(path, **asdict(config)) as renderer:
         serve(renderer, address, port, ready)

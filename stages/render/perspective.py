@@ -109,7 +109,7 @@ def make_ground(surface: Surface, window: Window, factor: int) -> Ground:
 class Scene:
     """What a camera sees of a surface in some light.
 
-    ground : with no coefficients where extensions have shaded it; horizon : (h, w), rad, or None
+    horizon : (h, w), rad, or None
     lit : (2, h, w) I/F where extensions have shaded the ground beforehand, and where it was clipped at 0; or None
     added : (h, w) I/F that the Earth and the terrain around add, or None
     samples : rays per pixel and axis; distance : from the camera to the ground, m

@@ -71,6 +71,8 @@ class Renderer:
         self.config = replace(Config(view="pinhole") if config is None else config, **settings)
         if sensor is not None:
             self.config = replace(self.config, sensor=str(sensor))
+        if config is None:  # a command has checked its own
+            check(replace(self.config, position=self.config.position or (0.0, 0.0, 0.0)), drawn_sun=True)
         self.sensor = None if self.config.sensor is None else read_sensor(self.config.sensor)
         keep_freed_memory()  # page faults of new arrays would cost as much as the rays
         self._body = find_body("moon" if self.config.body is None else self.config.body)

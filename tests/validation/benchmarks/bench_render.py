@@ -1,4 +1,4 @@
-"""A 1024 x 1024 perspective view of a 4096 x 4096 DEM beside Mitsuba, and an ortho map streamed in blocks.
+"""A 1024 x 1024 perspective view of a 4096 x 4096 DEM beside Mitsuba, views a second, and an ortho map streamed in blocks.
 
     python tests/validation/benchmarks/bench_render.py [--dem 4096] [--view 1024] [--map 4096]
 
@@ -23,6 +23,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "support"))
 
 from relief import body_point, hills
 
+from stages.physics.maps.geotiff import MapTiff
 from stages.physics.maps.grid import Grid, local_metric_crs
 from stages.physics.photometry import get_model
 from stages.physics.terrain.shading import Light, shade_block
@@ -30,6 +31,7 @@ from stages.physics.terrain.sun import sun_from_angles
 from stages.physics.terrain.sun_visibility import SunHorizon
 from stages.physics.terrain.surface import Surface
 from stages.render.perspective import make_scene, render_view
+from stages.render.renderer import Renderer
 from stages.render.viewpoint import look_at, pinhole_view
 
 RADIUS, GSD, ALBEDO, FOV = 1737400.0, 5.0, 0.3, 20.0
@@ -110,6 +112,32 @@ def peer_image(mi, scene, centre, camera):
     return np.array(mi.render(scene, sensor=sensor, integrator=integrator))[..., 0]
 
 
+def views_per_second(surface):
+    """A descent through the same Renderer, the Sun's horizon kept; wall and CPU seconds a view after the first."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "dem.tif"
+        with MapTiff(path, surface.grid, ["elevation"], {}, ["m"]) as tif:
+            tif.put(0, 0, surface.elevation[None])
+        for rays in (1, 2):
+            with Renderer(path, model="hapke", samples=rays) as renderer:
+                for size in (512, 1024):
+                    places = [(1 - 0.05 * k) * 0.3 * surface.grid.height * GSD for k in range(9)]
+                    cameras = [descending(surface.grid, height, size) for height in places]
+                    angle = {"sun_azimuth_deg": 120.0, "sun_elevation_deg": 25.0}
+                    renderer.view(cameras[0], angle)
+                    _, seconds = timed(lambda c=cameras, r=renderer, a=angle: [r.view(one, a) for one in c[1:]])
+                    wall, cpu = seconds / (len(cameras) - 1)
+                    print(f"{size} x {size}, {rays**2} rays a pixel: {1 / wall:.1f} views/s ({cpu:.2f} s CPU a view)")
+
+
+def descending(grid, height, size):
+    """A camera over the middle of a map that looks 30 deg ahead."""
+    middle = grid.height / 2
+    place = body_point(grid, middle, middle, height)
+    ahead = body_point(grid, middle - 0.58 * height / GSD, middle, 0.0)
+    return pinhole_view(place, look_at(place, ahead), 40.0, (size, size), RADIUS)
+
+
 def _pair(values):
     return f"{values[0]:.2f} ({values[1]:.2f})"
 
@@ -168,6 +196,7 @@ def main() -> None:
             line += f"{_pair(render_seconds):>18s}{_pair(whole):>18s}{_pair(ratio):>20s}{_pair(alone):>16s}"
             line += f"  {image[both].mean() / theirs[both].mean():.4f}"
         print(line)
+    views_per_second(surface)
     rows = options.map
     light = Light(sun, SunHorizon(surface.elevation, grid, sun, relief[1] - relief[0]), None)
     shade_block(surface, light, 0, 0, 256, 256)
