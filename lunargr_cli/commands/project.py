@@ -66,7 +66,7 @@ def command(
         typer.Option("--shifts", metavar="CSV", help="Also write the shift of each block to a table."),
     ] = None,
     exact: Annotated[
-        bool, typer.Option("--exact", help="Keep full float32 precision; the file is three times as large.")
+        bool, typer.Option("--exact", help="Write float32, not packed 16-bit numbers; the file is twice as large.")
     ] = Config.exact,
     shard: options.Shard = None,
     output: options.OutputFile = Path("pairs.h5"),

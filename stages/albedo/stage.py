@@ -92,17 +92,14 @@ def work(
             "incidence_bin": len(COSINES) - 1,
             "level": 2,
         }
-        with contextlib.ExitStack() as stack:
-            writer = stack.enter_context(
-                ArtefactWriter(
-                    output.file,
-                    SVBRDF,
-                    sizes,
-                    config=asdict(config),
-                    inputs=[svbrdf, scene],
-                    attributes=kept_attributes(ground.map),
-                )
-            )
+        with ArtefactWriter(
+            output.file,
+            SVBRDF,
+            sizes,
+            config=asdict(config),
+            inputs=[svbrdf, scene],
+            attributes=kept_attributes(ground.map),
+        ) as writer:
             blocks = _blocks(ground)
             own = blocks.own_rows(config.shard)
             if config.shard[1] > 1:
@@ -113,8 +110,7 @@ def work(
                 maps.put(block, *work_block(ground, found, block))
             maps.close()
             if as_geotiff(config):
-                partial = stack.enter_context(atomic_path(output.geotiff_path))
-                write_geotiff(partial, writer.file, read_grid(writer.file, output.file))
+                write_geotiff(output.geotiff_path, writer.file, read_grid(writer.file, output.file))
             return _summary(writer.file, config, scene)
 
 

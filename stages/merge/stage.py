@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from schemas import ArtefactWriter, Schema, atomic_path, read_config
+from schemas import ArtefactWriter, Schema, read_config
 from schemas.checks import is_foreign
 from schemas.command_line import whole_command
 from schemas.files.outputs import Output
@@ -42,8 +42,7 @@ def work(parts: Sequence[Path], output: Output, config: Config, progress: Progre
                 join_variable(opened, name, writer, config.virtual)
             join_paths(opened, writer.file, output.file)
             if as_geotiff:
-                with atomic_path(output.geotiff_path) as partial:
-                    write_geotiff(partial, writer.file, read_grid(writer.file, output.file))
+                write_geotiff(output.geotiff_path, writer.file, read_grid(writer.file, output.file))
             progress(len(opened.names), len(opened.names), "merging")
         return opened.schema
 

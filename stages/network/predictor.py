@@ -14,13 +14,13 @@ import torch
 from torch import Tensor
 
 from schemas.artefacts import CHECKPOINT
-from schemas.errors import ArtefactError, ConfigError, RegistryError
+from schemas.errors import ArtefactError, ConfigError
 from schemas.reading import open_artefact, read_config, read_strings
 from stages.network.checkpoint_layout import check_finite, check_weights, read_layout
 from stages.network.coefficient_maps import CoefficientMaps
 from stages.network.normalisation import scale_elevation
 from stages.network.unet import UNet
-from stages.physics.photometry import get_model
+from stages.physics.photometry import named_model
 
 
 class Predictor(torch.nn.Module):
@@ -117,10 +117,7 @@ def load_predictor(path: Path, device: torch.device | str = "cpu", model: str | 
             raise ArtefactError(
                 f"{path}: expected a checkpoint for model '{model}', found one for '{name}'; train again or drop `model`."
             )
-        try:
-            reflectance = get_model(name)
-        except RegistryError as error:
-            raise ArtefactError(f"{path}: root attribute 'model': {error}") from None
+        reflectance = named_model(path, file)
         names = [p.name for p in reflectance.parameters]
         found, maps = (json.loads(str(file.attrs[key])) for key in ("coefficients", "maps"))
         if found != names or not maps or not set(map(str, maps)) <= set(names):

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas import NORMALIZED, SCENE, SVBRDF, ArtefactWriter, ConfigError, InputError, open_artefact
-from schemas.files.outputs import Output, atomic_path
+from schemas.files.outputs import Output
 from stages.common.arrays import Floats32
 from stages.common.progress import Progress
 from stages.common.runner.stage import as_geotiff
@@ -105,8 +105,7 @@ def work(scene: Path, svbrdf: Path | None, output: Output, config: Config, progr
             maps.put(box, work_block(ground, levels, box))
         maps.close(references, levels, layers)
         if as_geotiff(config):
-            partial = stack.enter_context(atomic_path(output.geotiff_path))
-            write_geotiff(partial, writer.file, references.surface.grid)
+            write_geotiff(output.geotiff_path, writer.file, references.surface.grid)
         return maps.summarise(references.frames, levels, ground.units, compare_angles(samples, references.frames))
 
 

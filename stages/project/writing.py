@@ -17,7 +17,7 @@ from stages.physics.images.table import Frame
 from stages.physics.maps import rasters
 from stages.project.summary import Summary, extremes, often_negative
 
-IMAGE = Packing(2.0**-15, 15 / 16)  # I/F of -0.06 to 1.94, in the step of the calibrated images of LROC
+IMAGE = Packing(33 * 2.0**-20)  # I/F of -1.03 to 1.03 in steps of 3.1e-5, as fine as the calibrated images of LROC
 COUNTS = Packing(2.0**-7)  # of images of 8 bits
 DEGREES = Packing(2.0**-8)
 RAYS = ("detector_line", "detector_sample", "emission_deg", "phase_deg")

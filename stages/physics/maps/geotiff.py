@@ -21,6 +21,7 @@ from rasterio.errors import RasterioIOError
 from rasterio.io import DatasetReader, DatasetWriter
 from rasterio.windows import Window
 
+from schemas.files.outputs import atomic_path
 from schemas.provenance import pack_record
 from schemas.rasters import TIFF_TAG
 from schemas.reading import read_strings
@@ -111,7 +112,7 @@ def _as_full_disk() -> Iterator[None]:
 def write_geotiff(path: Path, file: h5py.File, grid: Grid) -> None:
     """The map that an open artefact holds, as a cloud-optimised GeoTIFF: coefficients of an svbrdf.h5, or mosaics."""
     names, fields, tags = (_mosaics if "mosaic" in file else _coefficients)(file)
-    with MapTiff(path, grid, names, tags, ["1"] * len(names)) as tiff:
+    with atomic_path(path) as partial, MapTiff(partial, grid, names, tags, ["1"] * len(names)) as tiff:
         tiff.put_all(*fields)
 
 

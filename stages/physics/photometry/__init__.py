@@ -28,6 +28,7 @@ from stages.physics.photometry.base import (
     lambert_albedo,
     masked_radiance_factor,
     model_names,
+    named_model,
     register,
 )
 from stages.physics.photometry.published import ParameterSet, get_set, published_sets
@@ -84,6 +85,7 @@ __all__ = [
     "lambert_albedo",
     "masked_radiance_factor",
     "model_names",
+    "named_model",
     "published_sets",
     "register",
 ]

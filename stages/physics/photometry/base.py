@@ -6,11 +6,13 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import ClassVar
 
+import h5py
 import torch
 
-from schemas.errors import RegistryError
+from schemas.errors import ArtefactError, RegistryError
 from stages.physics.formation.geometry import Angles
 
 
@@ -157,6 +159,14 @@ def get_model(name: str) -> ReflectanceModel:
         return _MODELS[name.lower()]
     except KeyError:
         raise RegistryError.unknown("reflectance model", name, model_names()) from None
+
+
+def named_model(path: Path, file: h5py.File) -> ReflectanceModel:
+    """The model that an open artefact names. Raises ArtefactError for one that is not registered."""
+    try:
+        return get_model(str(file.attrs["model"]))
+    except RegistryError as error:
+        raise ArtefactError(f"{path}: root attribute 'model': {error}") from None
 
 
 def model_names() -> list[str]:

@@ -15,13 +15,13 @@ from rasterio.io import DatasetReader
 from rasterio.windows import Window
 
 from schemas.artefacts import SCENE, SVBRDF
-from schemas.errors import ArtefactError, ConfigError, InputError, RegistryError
+from schemas.errors import ArtefactError, ConfigError, InputError
 from schemas.reading import open_artefact, read_kind, read_strings
 from stages.common.arrays import Floats32
 from stages.physics.bodies.spheres import Body
 from stages.physics.maps.grid import Grid, read_grid, require_crs
 from stages.physics.maps.rasters import check_metres, check_single_band, open_raster, pixel_size_at, read_window
-from stages.physics.photometry import ReflectanceModel, get_model, in_radians
+from stages.physics.photometry import ReflectanceModel, in_radians, named_model
 from stages.physics.photometry.albedo_factor import AlbedoFactor
 from stages.physics.photometry.published import find_reflectance
 
@@ -206,10 +206,7 @@ def _mapped_surface(path: Path, file: h5py.File, grid: Grid, elevation: Elevatio
         raise ConfigError(
             f"`model`: {path.name} holds its own reflectance ({name}); to render its terrain with another model give `dem` {path.name}."
         )
-    try:
-        reflectance = get_model(name)
-    except RegistryError as error:
-        raise ArtefactError(f"{path}: root attribute 'model': {error}") from None
+    reflectance = named_model(path, file)
     expected, found = [p.name for p in reflectance.parameters], read_strings(file, "coefficient_name")
     if found != expected:
         raise ArtefactError(
