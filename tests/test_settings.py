@@ -30,7 +30,7 @@ CONFIGS = {
 WRITTEN = {
     "widths": join_numbers, "dropout": join_numbers, "shard": lambda shard: None if shard == parse_shard(None) else shard,
     **dict.fromkeys(("maps", "only", "leave_out", "free"), lambda names: names or None),
-    "size_px": lambda size: ",".join(map(str, size)), "parameters": lambda values: values or None,
+    "size_px": lambda size: ",".join(map(str, size)), "parameters": lambda values: values or None, "export": lambda kinds: kinds or None,
 }  # fmt: skip
 # Of the same name, but not the setting: where the GeoTIFF goes, not whether; left away for the stage's own choice.
 OTHERS = {
