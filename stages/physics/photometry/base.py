@@ -7,13 +7,15 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
-import h5py
 import torch
 
 from schemas.errors import ArtefactError, RegistryError
 from stages.physics.formation.geometry import Angles
+
+if TYPE_CHECKING:
+    import h5py
 
 
 @dataclass(frozen=True)
