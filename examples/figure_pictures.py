@@ -231,13 +231,9 @@ def shrink(source: Path, output: Path, width: int) -> None:
 
 def main(root: Path) -> None:
     demo, apollo, images = root / "demo-full", root / "results" / "apollo15", root / "docs" / "images"
-    if has(
-        demo, "make demo-full", "evaluation.h5", "pairs.h5", "render.tif", "render.png", "figures/match_daisy_1.png"
-    ):
+    if has(demo, "make demo-full", "evaluation.h5", "pairs.h5", "render.tif"):
         draw_relit(demo, images / "demo_relit.jpg")
-        shrink(demo / "render.png", images / "demo_render.jpg", 900)
         draw_differences(demo, images / "demo_crop.jpg")
-        shrink(demo / "figures" / "match_daisy_1.png", images / "demo_match.jpg", 1000)
     if has(apollo, "make reproduce-apollo15", "scene.h5", "pairs.h5", "fold_3.h5"):
         draw_apollo15(apollo, images / "apollo15.jpg")
 

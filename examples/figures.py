@@ -189,7 +189,7 @@ def matched(root: Path, name: str, command: str) -> list[str]:
 
 
 def diagnosed(root: Path, folder: str, command: str) -> list[str]:
-    """The named causes with their values, the gain on unseen pairs, and what the data leave open."""
+    """The named causes with their values, and the gain on unseen pairs."""
     result = read(root, f"{folder}/diagnosis.json", command)
     data, judged = result["data"], result.get("held_out") or {}
     rows = []
@@ -202,8 +202,6 @@ def diagnosed(root: Path, folder: str, command: str) -> list[str]:
     if rows and judged.get("gain_percent") is not None:
         gain = percent(judged["gain_percent"], judged["gain_percent_low"], judged["gain_percent_high"])
         lines.append(f"- With these causes the squared error on {judged['pairs']} unseen pairs is lower by {gain}.")
-    if result.get("blind"):
-        lines.append(f"- These data cannot show whether the following are present: {listed(result['blind'])}.")
     return lines
 
 
@@ -400,7 +398,6 @@ BLOCKS: dict[str, Callable[[Path], list[str]]] = {
     "demo-diagnosis": lambda root: diagnosed(root, "demo-full", DEMO),
     "apollo15": apollo15,
     "apollo15-held-out": lambda root: held_out(root, "results/apollo15/held_out.json", APOLLO),
-    "apollo15-match": lambda root: matched(root, "results/apollo15/match.json", APOLLO),
     "apollo15-diagnosis": lambda root: diagnosed(root, "results/apollo15", APOLLO),
     "models": models,
     "diagnose-campaigns": diagnose_campaigns,

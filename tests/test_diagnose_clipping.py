@@ -11,8 +11,8 @@ import pytest
 import torch
 from second_laboratory.cases import deal, make_case
 
-from stages.diagnose.likelihood.jackknife import gain_interval
-from stages.diagnose.result import named
+from stages.diagnose.likelihood.intervals import gain_interval
+from stages.diagnose.sources import clipping
 from stages.effects import get_effect
 
 
@@ -89,9 +89,9 @@ def test_images_that_are_cut_off_as_a_whole_are_clipping(monkeypatch):
             SimpleNamespace(predict=lambda p=p: p, site=SimpleNamespace(gain=torch.ones(6), offset=torch.zeros(6)))
             for p in predicted
         ]
-        monkeypatch.setattr(named, "full_light", lambda chain: torch.ones(6, 64, 64, dtype=torch.bool))
+        monkeypatch.setattr(clipping, "full_light", lambda chain: torch.ones(6, 64, 64, dtype=torch.bool))
         masks = [torch.ones(6, 64, 64, dtype=torch.bool)] * 4
-        before, after, _ = named._clipped(
+        before, after, _ = clipping._clipped(
             SimpleNamespace(chains=lambda c=chains: c), list(images), masks, get_effect("saturation")
         )
         assert (gain_interval(before, after)[1] > 0) == gains
@@ -113,9 +113,9 @@ def test_clipping_of_bright_ground_shows_beside_its_albedo(monkeypatch, cut):
         images.append(image.clamp(max=level) if cut else image)
     chain = SimpleNamespace(predict=lambda: predicted, site=SimpleNamespace(gain=torch.ones(4), offset=torch.zeros(4)))
     lit = torch.ones(4, 64, 64, dtype=torch.bool)
-    monkeypatch.setattr(named, "full_light", lambda chain: lit)
+    monkeypatch.setattr(clipping, "full_light", lambda chain: lit)
     monkeypatch.setattr(get_effect("saturation"), "read_off", classmethod(lambda cls, bright: (level, 0.0, 1.0)))
-    before, after, _ = named._clipped(
+    before, after, _ = clipping._clipped(
         SimpleNamespace(chains=lambda: [chain] * 5), images, [lit] * 5, get_effect("saturation")
     )
     assert (gain_interval(before, after)[1] > 0) == cut

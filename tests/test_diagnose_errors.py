@@ -11,13 +11,12 @@ import torch
 from hidden.terrain import make_terrain
 from scipy.ndimage import gaussian_filter
 
-from stages.diagnose.likelihood.covariance import Covariance, shadow_variance
-from stages.diagnose.likelihood.dem_errors import kept_share
-from stages.diagnose.likelihood.found import interval
-from stages.diagnose.likelihood.jackknife import folds, jackknife_error
-from stages.diagnose.model.aligned import aligned
-from stages.diagnose.rows.patches import make_grid
-from stages.diagnose.search import refine
+from stages.diagnose.data.aligned import aligned
+from stages.diagnose.judge import refine
+from stages.diagnose.likelihood import covariance
+from stages.diagnose.likelihood.covariance import Covariance, kept_share, shadow_variance
+from stages.diagnose.likelihood.intervals import folds, interval, jackknife_error
+from stages.diagnose.likelihood.patches import make_grid
 from stages.diagnose.settings import FOLDS
 from stages.effects import get_effect
 from stages.effects.filters import gaussian, seams
@@ -32,7 +31,7 @@ def test_the_error_of_an_rms_is_its_scatter_where_values_are_drawn_as_they_are_o
     squares = np.square(drawn).mean(1)
     rms = math.sqrt(squares.mean())
     scatter = float(squares.std()) / (2 * rms)
-    assert refine._error_of_rms(mean, mixed @ mixed.T, rms, 6) == pytest.approx(scatter, rel=0.05)
+    assert refine.error_of_rms(mean, mixed @ mixed.T, rms, 6) == pytest.approx(scatter, rel=0.05)
 
 
 def test_a_seam_of_a_dem_is_not_sharpened():
@@ -54,7 +53,7 @@ def test_a_seam_of_a_dem_is_not_sharpened():
         assert torch.allclose(sharp["seamed"] - step, sharp["plain"], atol=0.06)
 
 
-def test_what_of_a_dem_may_be_errors_is_what_images_show_beside_it():
+def test_what_of_a_dem_may_be_errors_is_what_images_show_beside_it(monkeypatch):
     """Slopes that are white noise of a known variance: the share that is relief is one less the ratio of variances, wave by wave."""
     grid = make_grid(48, 48)
     rng = np.random.default_rng(3)
@@ -65,9 +64,12 @@ def test_what_of_a_dem_may_be_errors_is_what_images_show_beside_it():
     chains, patches = [], []
     for k in range(40):
         slopes = [torch.from_numpy(rng.normal(0, 0.01, (1, 48, 48))).float() for _ in range(2)]
-        chains.append(SimpleNamespace(state=SimpleNamespace(slopes=slopes)))
-        patches.append(SimpleNamespace(site=k, rows=slice(0, 48), columns=slice(0, 48)))
-    kept = kept_share(chains, patches, grid, model)(2 * torch.pi * grid.radius)
+        site = SimpleNamespace(image=torch.zeros(1, 48, 48))
+        chains.append(SimpleNamespace(state=SimpleNamespace(slopes=slopes), site=site, rendered=site.image))
+        transform = lambda fields, grid: (fields, fields)  # noqa: E731 - the residual is not looked at
+        patches.append([SimpleNamespace(site=k, rows=slice(0, 48), columns=slice(0, 48), transform=transform)])
+    monkeypatch.setattr(covariance, "estimate", lambda *_: model)
+    kept = kept_share(chains, patches, grid, 1)(2 * torch.pi * grid.radius)
     assert kept[:2].tolist() == [1.0, 1.0]
     assert kept[2:-1].numpy() == pytest.approx(np.full(grid.annuli - 3, 0.75), abs=0.04)
     assert kept[-1] < 1e-6  # all of it

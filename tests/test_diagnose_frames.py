@@ -13,8 +13,7 @@ from hidden.terrain import red_noise
 
 from stages.diagnose.result.answer import Answer, Named
 from stages.diagnose.result.files import write_diagnosis
-from stages.diagnose.result.named import by_catalogue
-from stages.diagnose.search import frames, ground
+from stages.diagnose.sources import frames, ground
 from stages.effects import Survey, get_effect
 
 SIZE, IMAGES = 64, 5
@@ -72,20 +71,14 @@ def test_a_field_of_every_frame_is_named_and_relief_is_not(monkeypatch, field, r
     monkeypatch.setattr(ground, "judged", lambda chain: (lit, ~lit))
     chains = [_chain(k, field, relief, rng) for k in (0, 2, 3, 5)]
     state = SimpleNamespace(chains=lambda: chains, data=Survey(units="dn"), has=frozenset())
-    named, shown = frames.by_images(state)
-    assert [c.effect.name for c in named] == (["frame_field"] if field else []) and shown == {"frame_field"}
+    (claim,) = frames.by_images(state)
+    assert (claim.decide() is None) == bool(field) and claim.name == "frame_field" and claim.would_show()
     if field:
-        value, error, _ = named[0].parameters["rms"]
-        assert abs(value - field) < 3 * error and error < 0.008 and named[0].percent[1] > 0
+        value, error, _ = claim.named.parameters["rms"]
+        assert abs(value - field) < 3 * error and error < 0.01 and claim.named.percent[1] > 0
     # a calibrated image has no response of its own: what is left is light, and has no name in the catalogue
     state.data = Survey(units="iof")
-    strays, _ = frames.by_images(state)
-    assert [c.effect.listed for c in strays] == [False] * bool(field)
-    listed, words = by_catalogue([*named, *strays])
-    assert listed == named and len(words) == len(strays)
-    for what in words:
-        value, error = (float(x) for x in what[what.rindex("(") + 1 : -1].split(" +- "))
-        assert abs(value - field) < 3 * error and error < 0.01
+    assert [(c.decide() is None, c.named.effect.listed) for c in frames.by_images(state)] == [(bool(field), False)]
 
 
 def test_values_per_image_of_a_site_are_written_and_act_on_that_crop_alone(tmp_path):

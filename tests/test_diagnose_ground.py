@@ -11,9 +11,9 @@ import torch
 from hidden.terrain import red_noise, units
 
 from stages.diagnose.likelihood.covariance import Covariance
+from stages.diagnose.likelihood.patches import make_grid, make_patches
 from stages.diagnose.likelihood.products import Rows, Shams, products
-from stages.diagnose.rows.patches import make_grid, make_patches
-from stages.diagnose.search import ground
+from stages.diagnose.sources import ground
 from stages.effects import get_effect
 
 LOW, HIGH = math.radians(9.0), math.radians(50.0)
@@ -124,9 +124,8 @@ def test_a_pattern_of_the_ground_is_named_where_other_images_show_it(monkeypatch
         return SimpleNamespace(site=site, predict=lambda: plain, render=render)
 
     chains = [chain(k) for k in (0, 2, 3, 7)]
-    named, shown = ground.by_ground(SimpleNamespace(chains=lambda: chains, data=None))
-    assert shown == {"albedo_map"}
-    assert [c.effect.name for c in named] == (["albedo_map"] if rays else [])
+    (claim,) = ground.by_ground(SimpleNamespace(chains=lambda: chains, data=None))
+    assert claim.name == "albedo_map" and (claim.decide() is None) == rays
     if rays:
-        value, error, _ = named[0].parameters["per_std"]
-        assert value == pytest.approx(0.1, abs=0.002) and error < 0.05 and named[0].percent[1] > 90
+        value, error, _ = claim.named.parameters["per_std"]
+        assert value == pytest.approx(0.1, abs=0.003) and error < 0.05 and claim.named.percent[1] > 90

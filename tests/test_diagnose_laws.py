@@ -1,36 +1,30 @@
-"""The measured laws that diagnose fits, against laws that were written elsewhere."""
+"""Departures of the ground's law from the nominal one, against laws that were written elsewhere."""
 
 from __future__ import annotations
-
-import copy
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from hidden.laws import LAWS
-from laboratory.cases import Deal, make_case
 from orbital_angles import orbital_cosines
 from planted import semi_real
 
-from stages import diagnose
-from stages.diagnose.likelihood.found import Found
-from stages.diagnose.model.form import better_form, measured_laws, other_laws, relative_misfit
-from stages.diagnose.model.laws import LunarLaws, lunar_laws
-from stages.diagnose.model.nominal import fit, load_nominal
-from stages.diagnose.model.sites import Site, load_site, survey
+from stages.diagnose.data.sites import Site, load_site
+from stages.diagnose.judge.state import Cause, State
+from stages.diagnose.likelihood.columns import Guise
+from stages.diagnose.likelihood.patches import cuts
+from stages.diagnose.likelihood.weigh import Found
+from stages.diagnose.model.laws import departures
+from stages.diagnose.model.nominal import fit, load_nominal, relative_misfit
 from stages.diagnose.registration.explain import explain
-from stages.diagnose.rows.columns import Guise
-from stages.diagnose.rows.patches import cuts
-from stages.diagnose.search.state import Cause, State
 from stages.effects import Survey, effect_names, get_effect
 from stages.pairs.reader import PairReader
 from stages.physics.formation.geometry import Angles
+from stages.physics.photometry import get_model
 
 # percent of brightness, rms: what a law leaves passes for causes, since noise of so many pixels is averaged to 0.01 %
 LEFT = {
-    "hapke": 0.04, "hapke_rough": 0.08, "lunar_lambert": 0.02, "akimov": 0.03, "minnaert": 0.03, "lroc_2014": 0.1,
-    "lroc_2019": 0.02,
+    "hapke": 0.1, "hapke_rough": 0.15, "lunar_lambert": 0.1, "akimov": 0.1, "minnaert": 0.1, "lroc_2014": 0.2, "lroc_2019": 0.1,
 }  # fmt: skip
 
 
@@ -40,24 +34,35 @@ def angles():
     return torch.from_numpy(orbital_cosines(np.random.default_rng(5), np.radians(np.linspace(10, 70, 12)), 0.15, 1500))
 
 
+M2 = get_model("M2")
+VECTOR = torch.tensor([p.default for p in M2.parameters]).double()
+
+
 @pytest.fixture(scope="module")
 def laws(angles):
-    return lunar_laws(angles[:, ::2])
+    return departures(M2, VECTOR, angles[:, ::2])
+
+
+def _nominal(vector, at):
+    return M2.radiance_factor(M2.unpack(vector[None, :, None], dim=1), at)[0]
 
 
 @pytest.mark.parametrize("name", LEFT)
-def test_a_law_is_followed_with_coefficients_that_are_no_surprise(laws, angles, name):
-    """Coefficients scatter as those of measured laws: the law is one of them, as far as brightness can tell."""
+def test_a_law_is_followed_with_departures_that_are_no_surprise(laws, angles, name):
+    """Amounts scatter as those of measured laws do: the law is one of them, as far as brightness can tell."""
     apart = angles[:, 1::2]
     truth = LAWS[name](*apart.numpy(), 1.0)
-    parts = laws.parts(Angles(*apart.unbind(0))).double().numpy()
-    a, b = (parts / truth).T, np.ones(len(truth))
-    scatter = laws.scatter.double().numpy()
-    precision = np.diag(np.r_[0.0, (np.abs(parts[0] / truth).mean() * scatter[1:]) ** -2])
-    found = np.linalg.solve(a.T @ a * 1e5 + precision, a.T @ b * 1e5)  # as of many pixels with a noise of 0.3 %
-    left = 100 * np.sqrt(np.mean((a @ found - b) ** 2))
-    assert left < LEFT[name]
-    assert np.abs(found[1:] / found[0] / scatter[1:]).max() < 4
+    at = Angles(*apart.unbind(0))
+    parts = laws.parts(at).double().numpy()
+    basis = torch.stack([_nominal(unit, at) for unit in torch.eye(len(VECTOR)).double()]).numpy()
+    a = np.concatenate([basis, parts]) / truth
+    known = np.diag(np.r_[np.zeros(len(basis)), np.ones(len(parts))])  # as of many pixels with a noise of 0.3 %
+    level = _nominal(VECTOR, at).mean().item() / truth.mean()  # departures are of a law of this brightness
+    found = np.linalg.solve(a @ a.T * 1e5 + known, a.sum(1) * level * 1e5)
+    assert 100 * np.sqrt(np.mean((found @ a / level - 1) ** 2)) < LEFT[name]
+    assert np.abs(found[len(basis) :]).max() < 4
+    amounts = torch.from_numpy(found[len(basis) :])
+    np.testing.assert_allclose(laws.added(amounts, at).numpy(), found[len(basis) :] @ parts, rtol=1e-4, atol=1e-7)
 
 
 def test_between_the_angles_of_a_steep_crater_and_of_all_other_ground_no_law_runs_away():
@@ -70,10 +75,9 @@ def test_between_the_angles_of_a_steep_crater_and_of_all_other_ground_no_law_run
     steep = every[:, (emission > 1.05) & (emission < 1.1)][:, :5]
     low, high = np.minimum(steep.min(1), angles.numpy().min(1)), np.maximum(steep.max(1), angles.numpy().max(1))
     between = every[:, (every > low[:, None]).all(0) & (every < high[:, None]).all(0)]
-    laws = lunar_laws(torch.cat([angles, torch.from_numpy(steep)], 1))
-    parts = laws.parts(Angles(*torch.from_numpy(between).unbind(0)))
-    mean = parts[0].numpy() / LAWS["akimov"](*between, 1.0)
-    assert mean.min() > 0.4 * np.median(mean) and mean.max() < 2.5 * np.median(mean)
+    laws = departures(M2, VECTOR, torch.cat([angles, torch.from_numpy(steep)], 1))
+    at = Angles(*torch.from_numpy(between).unbind(0))
+    assert (laws.parts(at).abs() / _nominal(VECTOR, at).mean()).max() < 2.5
 
 
 @pytest.fixture(scope="module")
@@ -84,50 +88,25 @@ def places(tmp_path_factory):
     return sites
 
 
-@pytest.mark.parametrize(
-    "name", [n if n in ("linear", "hapke") else pytest.param(n, marks=pytest.mark.slow) for n in LAWS]
-)
-def test_film_is_fitted_by_measured_laws_unless_the_ground_has_the_nominal_form(places, name):
-    """Albedo leaves most of the residual, whatever the law: what the right one leaves surely less need not be half of it."""
-    generator = torch.Generator().manual_seed(3)
-    nominal = load_nominal(None, "M2", "dn")
-    with torch.no_grad():
-        for site in places:
-            angles = nominal.chain(site, []).state.angles
-            cosines = [c.double().clamp(min=1e-3).numpy() for c in (angles.cos_incidence, angles.cos_emission)]
-            light = torch.as_tensor(LAWS[name](*cosines, angles.cos_phase.double().numpy(), 0.1)).float()
-            albedo = 1 + 0.03 * torch.randn(light.shape[1:], generator=generator)
-            gain, offset = torch.rand(2, site.count, 1, 1, generator=generator) + 0.5
-            site.gain, site.offset = torch.ones(site.count), torch.zeros(site.count)
-            site.read = site.image = 2000 * gain * light * albedo + 50 * offset
-        fit(nominal, places, [], "dn", [s.read for s in places], start=True)
-        nominal.laws = other_laws(nominal, places, "dn")
-        other = better_form(nominal, places, Survey(units="dn"))
-    assert isinstance(other and other.model, LunarLaws) == (name != "linear")
-
-
-@pytest.mark.parametrize("name", ["surge", "akimov"])
-def test_what_one_effect_of_the_law_explains_is_no_other_law(places, name):
-    """Both leave the nominal law far more than measured ones; a peak at opposition, written as another function here, is a cause all the same."""
+@pytest.mark.parametrize("name", ["linear", "hapke", "akimov"])
+def test_departures_are_fitted_where_the_ground_has_another_law(places, name):
+    """They take most of what the nominal law leaves of another one, and nothing of what it leaves of itself: albedo."""
     nominal, rng = load_nominal(None, "M2", "iof"), np.random.default_rng(3)
     with torch.no_grad():
         for site in places:
             angles = nominal.chain(site, []).state.angles
             cosines = [c.double().clamp(min=1e-3).numpy() for c in (angles.cos_incidence, angles.cos_emission)]
             cosg = angles.cos_phase.double().numpy()
-            light = LAWS["akimov" if name == "akimov" else "linear"](
-                *cosines, cosg, rng.normal(1, 0.03, cosg.shape[-2:])
-            )
-            if name == "surge":
-                light = light * (1 + 1.5 * np.exp(-np.arccos(cosg) / 0.3))
+            light = LAWS[name](*cosines, cosg, rng.normal(1, 0.01, cosg.shape[-2:]))
             site.gain, site.offset = torch.ones(site.count), torch.zeros(site.count)
             site.read = site.image = torch.as_tensor(light).float()
         fit(nominal, places, [], "iof", [s.read for s in places], start=True)
-        nominal.laws = other_laws(nominal, places, "iof")
-        measured = measured_laws(nominal, places, "iof")
-        assert relative_misfit(measured, places) ** 2 < 0.5 * relative_misfit(nominal, places) ** 2
-        other = better_form(nominal, places, survey(places, 8, "iof"))
-    assert (other is not None) == (name == "akimov")
+        plain = relative_misfit(nominal, places)
+        nominal.open_law(places)
+        fit(nominal, places, [], "iof", [s.read for s in places], law=True)
+        found = relative_misfit(nominal, places)
+    assert bool(nominal.amounts.any()) and found < 0.015
+    assert found < 0.7 * plain if name != "linear" else found > 0.9 * plain
 
 
 def test_an_image_whose_own_gain_is_not_known_does_not_fit_the_law(places):
@@ -147,7 +126,9 @@ def test_an_image_whose_own_gain_is_not_known_does_not_fit_the_law(places):
         off = {}
         for guise in (gains, moved):
             effect = get_effect(guise.effect)({}, Survey())
-            state.causes = [Cause(effect, Found(guise.effect, guise, np.zeros(1), np.ones(1), 0.0))]
+            state.causes = [
+                Cause(effect, Found(guise.effect, guise, np.zeros(1), np.ones(1), 0.0), np.zeros(1), np.ones(1))
+            ]
             state.fit()
             off[guise.effect] = float((nominal.vector / true - 1).abs().max())
             assert [site.unknown for site in places] == [frozenset({3} if guise is gains else ())] * len(places)
@@ -173,38 +154,6 @@ def test_ground_that_is_darker_than_other_ground_does_not_bend_the_law(places):
     assert float((nominal.vector / nominal.vector[0] / true - 1).abs().max()) < 0.05
 
 
-@pytest.mark.parametrize("adds", [500.0, 5000.0])
-def test_an_effect_of_the_law_beside_which_another_law_gains_is_a_part_of_that_law(monkeypatch, adds):
-    """Without a name any one effect of the law has to leave as little as another law does; beside one with a name a second is no excuse, and 5 % rms of what is left are."""
-    guise = Guise("phase_slope", get_effect("phase_slope").trials(Survey())[0], (0,))
-    whole = SimpleNamespace(
-        form_places=lambda: np.array([1]), gram=np.array([[1e6]]), plan=SimpleNamespace(guises=[guise]), seen=np.ones(2, bool),
-        places=lambda guise: np.array([1]), another_law=lambda guise, surely: 0.0 if guise else adds, exclude=lambda guise: [],
-        reduce=lambda *_: (np.eye(1), np.array([amount]), None, None),
-    )  # fmt: skip
-    size = abs(next(iter(guise.trial.columns[0].values())))
-    measured = object()
-    monkeypatch.setattr("stages.diagnose.search.state.measured_laws", lambda *_: measured)
-    monkeypatch.setattr(State, "fit", lambda self: None)
-    nominal = load_nominal(None, "M2", "iof")
-    nominal.laws = object()
-    state = State(nominal, [], Survey(), 0, "iof", frozenset(), 1)
-    amount = 0.1 / size
-    assert not state.law_is_another(SimpleNamespace(whole=whole))
-    amount = 0.7 / size  # more than any departure from a law is: another law
-    assert State(copy.copy(nominal), [], Survey(), 0, "iof", frozenset(), 1).law_is_another(
-        SimpleNamespace(whole=whole)
-    )
-    of_law, other = (
-        Cause(get_effect(name)({}, Survey()), Found(name, guise, np.ones(1), np.ones(1), 9.0))
-        for name in ("limb_darkening", "column_pattern")
-    )
-    state.causes = [of_law, other]
-    assert state.law_is_another(SimpleNamespace(whole=whole)) == (adds > 1250)
-    assert (state.nominal is measured) == (adds > 1250)
-    assert state.causes == ([other] if adds > 1250 else [of_law, other])
-
-
 def test_beside_free_gains_no_effect_of_the_law_is_visible():
     of_law = [get_effect(n) for n in effect_names() if get_effect(n).of_law]
     assert len(of_law) > 3
@@ -226,13 +175,3 @@ def test_pieces_of_one_place_are_left_out_side_by_side(tmp_path, monkeypatch):
             found = explain(sites, nominal, [], frames, 0.0)
     assert "valid" not in changed
     assert found.squares["none"].shape == (len(sites) * cuts(sites[0].image.shape[-1], len(sites)) ** 2, frames)
-
-
-@pytest.mark.slow
-def test_what_the_test_pairs_refuse_of_the_law_was_another_law(tmp_path):
-    """Another laboratory's ground, seen obliquely: limb darkening of a half takes 17,000 nats away, and makes ground that was not learned worse."""
-    path = tmp_path / "pairs.h5"
-    make_case(95, Deal("b", effect="albedo_map"), 20261126, path)
-    answer = diagnose.run(path).answer
-    assert answer.form == "measured lunar laws"
-    assert "limb_darkening" not in {c.effect.name for c in answer.causes}

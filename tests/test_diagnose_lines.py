@@ -11,10 +11,10 @@ import torch
 from planted import semi_real
 from scipy.ndimage import map_coordinates
 
+from stages.diagnose.data.sites import load_site
+from stages.diagnose.judge.claim import Reason, decide, of_size
 from stages.diagnose.model.nominal import fit, load_nominal
-from stages.diagnose.model.sites import load_site
 from stages.diagnose.registration.explain import explain
-from stages.diagnose.search.doubts import ORDINARY, doubt_size
 from stages.effects.line_jitter import ORDERS, LineJitter
 from stages.pairs.reader import PairReader
 
@@ -100,6 +100,11 @@ def test_relief_that_a_smooth_dem_lacks_is_no_jitter(registered):
 
 
 def test_a_registered_size_has_to_pass_the_rules_of_every_name():
-    assert doubt_size(0.5, 0.05, LineJitter) == ""
-    assert doubt_size(0.22, 0.05, LineJitter).startswith(ORDINARY)
-    assert "standard errors from zero" in doubt_size(0.5, 0.15, LineJitter)
+    before = np.full(8, 100.0)
+
+    def refused(size, error):
+        return decide(of_size(LineJitter({}), "rms_px", size, error, before, before - np.arange(1.0, 9.0)))
+
+    assert refused(0.5, 0.05) is None
+    assert refused(0.16, 0.035).reason is Reason.ORDINARY
+    assert refused(0.5, 0.15).reason is Reason.UNSURE

@@ -10,6 +10,7 @@ import numpy as np
 
 from stages import report
 from stages.common.page import diagnosis as common
+from stages.diagnose.judge.claim import Reason, Refusal
 from stages.diagnose.result import drawings, page
 from stages.diagnose.result.answer import Answer, HeldOut, Named
 from stages.effects import get_effect
@@ -22,7 +23,8 @@ def answer() -> Answer:
         "named",
         [cause],
         {"named": 0.12, "common_to_images": 0.8, "own_to_image": 0.06, "noise": 0.02},
-        {"echo": (151.4, "the values <that> fit best are impossible")},
+        [],
+        {"echo": Refusal(Reason.IMPOSSIBLE, "<that>", 151.4)},
         {"none": (0.0, 0.0, 0.0), "constant": (0.85, 0.26, 1.44)},
         blind=["penumbra"],
         held_out=HeldOut(54, 5, 2e-5, 1e-5, 40.0, 60.0),

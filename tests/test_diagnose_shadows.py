@@ -11,13 +11,11 @@ import torch
 from laboratory.cases import Deal, make_case
 
 from stages import diagnose
+from stages.diagnose.likelihood.patches import _without_lit
 from stages.diagnose.model.chain import Chain
-from stages.diagnose.result import score
-from stages.diagnose.result.answer import Named
-from stages.diagnose.rows.patches import _without_lit
-from stages.diagnose.search.shadows import by_shadows
-from stages.diagnose.search.walls import hide_dark
-from stages.effects import Survey, get_effect
+from stages.diagnose.sources.shadows import by_shadows
+from stages.diagnose.sources.walls import hide_dark
+from stages.effects import Survey
 from stages.physics.horizon import horizon, occluder_distance
 from stages.physics.light.sun_disc import sun_visibility, visibility_slope
 
@@ -89,7 +87,8 @@ def test_shadows_tell_a_wall_the_sun_and_its_disc_whatever_the_law(planted, name
     rng = np.random.default_rng(5)
     chains = [ShadowedGround(rng, k, **planted) for k in range(4)]
     survey = Survey(crop_px=64, gsd=10.0)
-    found, _ = by_shadows(SimpleNamespace(chains=lambda: chains, causes=[], data=survey, free_gains=False))
+    claims = by_shadows(SimpleNamespace(chains=lambda: chains, causes=[], data=survey, free_gains=False))
+    found = [claim.named for claim in claims if claim.decide() is None]
     assert [c.effect.name for c in found] == ([name] if name else [])
     if name:
         value, error, _ = found[0].parameters[parameter]
@@ -108,7 +107,7 @@ def test_a_horizon_is_known_where_the_sun_was_said_to_be():
             [[math.cos(turn), math.sin(turn), 0.0], [-math.sin(turn), math.cos(turn), 0.0], [0.0, 0.0, 1.0]]
         )
     state = SimpleNamespace(chains=lambda: chains, causes=[], data=Survey(crop_px=64, gsd=10.0), free_gains=False)
-    assert by_shadows(state) == ([], {})
+    assert not [claim for claim in by_shadows(state) if claim.decide() is None]
 
 
 @pytest.mark.parametrize("wall", [None, (150.0, 200.0)])
@@ -119,7 +118,7 @@ def test_images_that_a_wall_leaves_in_the_dark_are_no_part_of_what_the_law_is_fi
         chain.site.read, chain.site.hidden = chain.site.image, torch.zeros_like(chain.site.valid)
         chain.site.hide = lambda dark, site=chain.site: setattr(site, "hidden", dark)
     fitted = []
-    monkeypatch.setattr("stages.diagnose.search.walls.fit", lambda *args, **options: fitted.append(args))
+    monkeypatch.setattr("stages.diagnose.sources.walls.fit", lambda *args, **options: fitted.append(args))
     state = SimpleNamespace(
         chains=lambda: chains, data=Survey(crop_px=64, gsd=10.0), free_gains=False, sites=[c.site for c in chains],
         nominal=None, units="iof", leave_out_rare_images=lambda: None,
@@ -132,31 +131,6 @@ def test_images_that_a_wall_leaves_in_the_dark_are_no_part_of_what_the_law_is_fi
         assert (kept & dark).float().mean() < 0.01 < 0.2 < kept[:, 2].float().mean()
     else:
         assert not any(c.site.hidden.any() for c in chains)
-
-
-def test_lit_ground_says_how_much_nearer_to_nothing_a_value_is_that_shadows_tell(monkeypatch):
-    """It is found where it is large, and so too large: a DEM of 1.106 +- 0.02 whose lit ground looks as with 1.07 has 1.066, and the test pairs judge that."""
-    effect = get_effect("dem_scale")({"relative": 0.106})
-    cause = Named(
-        effect, {"relative": (0.106, 0.02, "1")}, 0.01, 500.0, 100.0, 1.0, 0.9, (5.0, 1.0, 9.0), ["dem_scale"]
-    )
-    monkeypatch.setattr(score, "_fitted_beside", lambda state, causes: causes)
-    state = SimpleNamespace(sites="learned", hidden="tested", nominal=None)
-
-    def squares_where_nothing_leaves(worst):
-        def squares(state, sites, models):
-            away = [float(c[0].effect.values["relative"]) - 0.07 if c else worst for _, c in models]
-            return [np.full(8, 1 + 30 * x * x) + np.arange(8) / 1e6 for x in away], 1e5
-
-        return squares
-
-    monkeypatch.setattr(score, "_squares_of", squares_where_nothing_leaves(0.0))  # test pairs like it best
-    found, _, refused = score.beside_shadows(state, [cause])
-    assert not found and "contradict" in refused["dem_scale"][1]
-    monkeypatch.setattr(score, "_squares_of", squares_where_nothing_leaves(0.07))
-    (found,), _, refused = score.beside_shadows(state, [cause])
-    assert found.parameters["relative"] == (pytest.approx(0.066), 0.02, "1") and not refused
-    assert float(found.effect.values["relative"]) == pytest.approx(0.066)
 
 
 def test_sunlit_specks_in_deep_shadow_are_no_light_that_falls_into_it():

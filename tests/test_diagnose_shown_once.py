@@ -10,8 +10,8 @@ import torch
 from planted import semi_real
 from scipy.ndimage import shift
 
+from stages.diagnose.data.sites import load_site
 from stages.diagnose.model.nominal import fit, load_nominal
-from stages.diagnose.model.sites import load_site
 from stages.diagnose.registration.explain import explain
 from stages.diagnose.registration.squares import shown_once
 from stages.effects.misregistration import ORDINARY

@@ -99,7 +99,6 @@ def test_a_diagnosis_lists_causes_with_units_and_what_stays_open(tmp_path):
               "held_out": gain(22.7, 10.6, 34.7) | {"pairs": 3}}  # fmt: skip
     text = filled("demo-diagnosis", tmp_path, {"demo-full/diagnosis.json": result})
     assert "|sun azimuth|error_deg = 4.32 ± 0.9 degree|" in text and "lower by 22.7 % (10.6 to 34.7)" in text
-    assert "present: dem scale and echo" in text
 
 
 def test_campaigns_of_diagnose_are_sums_of_the_list(tmp_path):

@@ -93,7 +93,7 @@ def test_every_score_leaves_it_out(trained, small_artefacts, tmp_path, monkeypat
     )
     assert result["crops"] == len(clean) and result["warnings"] == notes and notes[0] in said[0]
     scored = []
-    monkeypatch.setattr(diagnose, "_load", lambda reader, found, config: scored.append(found) or [])
+    monkeypatch.setattr(diagnose, "load", lambda reader, found, config: scored.append(found) or [])
     diagnose.run(pairs, checkpoint, config=diagnose.Config(), say=said.append)
     np.testing.assert_array_equal(scored[1], clean)
     assert notes[0] in said[-1]

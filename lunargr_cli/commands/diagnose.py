@@ -38,7 +38,7 @@ def command(
         typer.Option(
             "--model",
             autocompletion=complete_model,
-            help="Reflectance model to fit without a checkpoint; measured lunar laws replace it where they fit clearly better.",
+            help="Reflectance model to fit without a checkpoint, with the departures of measured lunar laws.",
         ),
     ] = Config.model,
     output: Annotated[
@@ -57,6 +57,9 @@ def command(
             help="Coefficients of --model to fit, separated by commas (default: all); the others keep published values.",
         ),
     ] = None,
+    law_known: Annotated[
+        bool, typer.Option("--law-known", help="The ground follows --model: fit its coefficients alone.")
+    ] = Config.law_known,
     list_effects: Annotated[bool, typer.Option("--list", help="Explain every effect and stop.")] = False,
     most_causes: Annotated[
         int, typer.Option("--causes", min=1, max=100, help="Maximum number of causes to name.")
@@ -100,6 +103,8 @@ def command(
     if answer["budget"]:
         shares = ", ".join(f"{name.replace('_', ' ')} {100 * share:.0f} %" for name, share in answer["budget"].items())
         write_out(f"Variance of the residual: {shares}.")
+    for c in answer["ordinary"]:
+        write_out(f"{c['effect']} is of a size that any data have: {describe(c['parameters'])}.")
     for r in answer["rejected"]:
         write_out(f"{r['effect']} is not named: {r['why']}.")
     write_out(f"{answer['verdict']}: {answer['sentence']}")

@@ -1,27 +1,19 @@
 """`lunargr diagnose`: what the simulation gets wrong, why, and what fixing it is worth.
 
-One likelihood, in six steps, each a folder:
+Sources of evidence claim, one function decides; ``stage.py`` tells it in order.
 
-model         The nominal simulation of every site, rendered again with small changes. Where its law does not fit, the mean of measured lunar
-              laws takes its place, with the directions in which these differ. Ground that a wall beyond the DEM darkens is left out.
-registration  Where the images lie. Shifts of up to 8 px are captured by correlation with the rendering, then explained: by nothing, a
-              constant, an affine map or a smooth field per frame, with or without relief displacement. The simplest form that no other
-              beats on held-out sites wins. Beside it lines of every image may be shifted against each other, as far as one half of
-              their samples tells the other.
-rows          Residuals relative to brightness, and what a little of everything would add to them, in windows on pieces of ground, as
-              Fourier coefficients. Deep shadow counts, shadow edges do not: which ground is dark is judged by itself, last (``search/shadows.py``).
-likelihood    The covariance of the residuals, estimated from them by wavelength: albedo and relief that all images of a place share,
-              what each image has of its own, noise. One image of a place is enough, several tell the parts apart. Under it, generalised least squares
-              for every effect, along with the nominal coefficients (which may drift from place to place, by as much as they are seen
-              to), the directions in which the law may be another one, errors of the DEM, gains and shifts per frame, and ordinary amounts of other effects. Sham residuals, those of other ground
-              mirrored and shuffled, say how large the largest of all statistics is when nothing is there.
-search        The effect that gains most on held-out ground, if shams hardly do as well, is rendered at its values and everything is fitted
-              again. It is named if it is real (its own file says what is plausible and what is ordinary), if it is there
-              whichever images are left out, and if its held-out gain is above zero for sure. What is surely there and ordinary is rendered
-              and not named. Then the next. Shadows and ground that images share are looked at by themselves, last.
-structure     What is left that neither ground nor noise has, and nothing in the catalogue explains: lines, seams and patterns of the detector, single pixels
-              (and effects that are in no catalogue, which the search finds).
-result        What is named, how much of the residual is what, what was refused and why, what these data could not have shown.
+data          Measured pairs by the ground that they show, laid over it.
+model         The nominal simulation of every site, rendered again with small changes. The directions in which measured lunar laws differ from it are
+              open, and fitted.
+registration  Where the images lie. Shifts of up to 8 px are captured by correlation with the rendering, then explained by a form that
+              predicts other sites best. Lines of an image may be shifted against each other.
+likelihood    Residuals relative to brightness as Fourier coefficients of windows, what a little of everything would add to them, their
+              covariance, and under it generalised least squares for every effect, beside all that is fitted along. Sham residuals say how
+              large the largest of all statistics is when nothing is there.
+sources       Claims: of the search over templates, of registration, shadows, the ground, frames and clipping.
+judge         A claim, its rivals, and ``decide``; the fit of all causes together; what is blind, by injection.
+faults        What is left varies between the cells of a partition of the detector by more than chance.
+result        The answer, its files and page, the gain on test pairs.
 
 Whatever is special about one effect stands in its own file under ``stages/effects``; the numbers set by hand that decide what is found stand in ``settings.py``.
 """

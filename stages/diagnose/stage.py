@@ -1,4 +1,4 @@
-"""The stage: the whole decision, in the order in which the package's own text tells it."""
+"""The stage: load, register, look, propose, judge, confirm, report."""
 
 from __future__ import annotations
 
@@ -20,51 +20,41 @@ from stages.common.progress import Progress, Say
 from stages.common.runner.job import Job
 from stages.diagnose import run
 from stages.diagnose.config import Config
-from stages.diagnose.likelihood.budget import budget
-from stages.diagnose.model.chain import Chain
-from stages.diagnose.model.form import better_form, other_laws, relative_misfit
-from stages.diagnose.model.laws import LunarLaws
-from stages.diagnose.model.nominal import Nominal, fit, lit_mask, load_nominal
-from stages.diagnose.model.parallel import per_site
-from stages.diagnose.model.sites import Site, all_over, grounds, load_site, survey
+from stages.diagnose.data.sites import Site, all_over, grounds, load_site, survey
+from stages.diagnose.faults import faults
+from stages.diagnose.judge.blind import blind_effects
+from stages.diagnose.judge.claim import Refusal
+from stages.diagnose.judge.state import State
+from stages.diagnose.model.nominal import Nominal, fit, load_nominal, relative_misfit
 from stages.diagnose.registration.explain import explain
-from stages.diagnose.registration.mimicked import mimicked_shift
 from stages.diagnose.result.answer import Answer, Named
+from stages.diagnose.result.budget import budget, mean_square
+from stages.diagnose.result.causes import by_search, in_words
 from stages.diagnose.result.files import write_diagnosis
-from stages.diagnose.result.named import Cut, by_catalogue, by_histogram, by_registration, by_search, outside_catalogue
-from stages.diagnose.result.score import (
-    beside_shadows,
-    blind_effects,
-    contradiction,
-    contradicts,
-    displacements,
-    score,
-    unconfirmed,
-)
-from stages.diagnose.search.doubts import doubt_all
-from stages.diagnose.search.frames import by_images
-from stages.diagnose.search.ground import by_ground
-from stages.diagnose.search.refine import settle
-from stages.diagnose.search.select import Outcome, search
-from stages.diagnose.search.shadows import by_shadows, contradicted
-from stages.diagnose.search.state import State
-from stages.diagnose.search.walls import hide_dark
-from stages.diagnose.settings import MIMICKED, MISFIT, STILL
-from stages.diagnose.structure.kinds import PILED, structure
-from stages.effects import effect_names, get_effect
+from stages.diagnose.result.held_out import displacements, score
+from stages.diagnose.settings import MISFIT
+from stages.diagnose.sources.clipping import Cut, by_clipping, by_histogram
+from stages.diagnose.sources.frames import by_images
+from stages.diagnose.sources.ground import by_ground
+from stages.diagnose.sources.measured import Measured
+from stages.diagnose.sources.placed import by_registration
+from stages.diagnose.sources.search import Outcome, finish, search
+from stages.diagnose.sources.shadows import by_shadows
+from stages.diagnose.sources.walls import hide_dark
+from stages.effects import effect_names
 from stages.pairs.ground import leave_out_learned
 from stages.pairs.reader import PairReader
 
 CROP = 128  # px: so large are the pairs that are counted, and of larger ones fewer are taken, for the memory that they need
+HIDDEN_SITES = 64  # of the test pairs that are scored
 
 
 @dataclass
 class Result:
-    """What a run gives; ``state`` and ``outcome`` are None where nothing was searched."""
+    """What a run gives; ``state`` is None where nothing was searched."""
 
     answer: Answer
     state: State | None
-    outcome: Outcome | None
 
     @property
     def report(self) -> dict[str, Any]:
@@ -116,7 +106,7 @@ def write_part(path: Path, pairs: Path, checkpoint: Path | None, config: Config)
     run(pairs, checkpoint, beside, config)
 
 
-def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, progress) -> Result:
+def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say: Say, progress: Progress) -> Result:
     """The whole decision on an open file."""
     if "sun_horizon_deg" not in reader.file:
         raise ArtefactError(
@@ -129,144 +119,127 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
         test, notes = leave_out_learned(reader, test, checkpoint, "test")
         for note in notes:
             say(f"note: {note}")
-    sites = _load(reader, train, config)
-    hidden = _load(reader, test, dataclasses.replace(config, most_sites=64))
+    sites = load(reader, train, config)
+    hidden = load(reader, test, dataclasses.replace(config, most_sites=HIDDEN_SITES))
     answer = Answer("cannot_tell", config={**dataclasses.asdict(config), "checkpoint": str(checkpoint or "")})
     answer.pairs, answer.sites = sum(s.count for s in sites), len(sites)
     answer.images = len({int(f) for s in sites for f in s.frames})
     if not sites:
         answer.note, answer.blind = "too few pixels of the pairs show lit ground", effect_names()
-        return Result(answer, None, None)
-    frames, units = len(reader.image_ids), reader.units
-    cut = by_histogram(sites, units)
-    fit(nominal, sites, [], units, [s.read for s in sites], start=True)
-    nominal.laws = other_laws(nominal, sites, units)
-    data = survey(sites, frames, units)
-    if other := better_form(nominal, sites, data):
-        nominal = other
-        fit(nominal, sites, [], units, [s.read for s in sites])
-    state = State(
-        nominal, sites, data, frames, units, frozenset({"sun_horizon"}), config.seed, hidden, say=say, progress=progress
-    )
-    state.leave_out_rare_images()
-    if hide_dark(state):
-        nominal.laws = other_laws(nominal, sites, units)
-    before = _residual(state)
+        return Result(answer, None)
+    cut = by_histogram(sites)
+    state = start(nominal, sites, hidden, reader, config, say, progress)
+    before = mean_square(state)
     if not before > 0:
         answer.note, answer.blind = "too few pixels of the pairs show fully lit ground", effect_names()
-        return Result(answer, state, None)
-    progress(1, 5, "registration")
-    _register(state)
-    misfit = relative_misfit(nominal, sites, varied=units == "dn", whole=True) * (0.5 if units == "dn" else 1.0)
+        return Result(answer, state)
+    progress(1, 4, "registration")
+    register(state)
+    varied = reader.units == "dn"
+    misfit = relative_misfit(nominal, sites, varied=varied, whole=True) * (0.5 if varied else 1.0)
     if not misfit < MISFIT:
         answer.verdict, answer.unexplained_fraction = "unexplained", 1.0
         answer.note = (
             f"the nominal model does not fit at all: its residual has {100 * misfit:.0f} % of the images' own signal; "
             "check units, Sun direction and registration before any cause is sought"
         )
-        return Result(answer, state, None)
-    progress(2, 5, "search")
+        return Result(answer, state)
+    progress(2, 4, "search")
     outcome = search(state, config.most_causes)
-    doubted = unconfirmed(state) | contradicted(state)
-    # what the test pairs refuse may have stood for another law
-    if any(get_effect(name).of_law for name in doubted) and state.choose_law(doubted):
-        outcome = search(state, config.most_causes)
-        doubted = unconfirmed(state) | contradicted(state)
-    if isinstance(state.nominal.model, LunarLaws):
-        answer.form = state.nominal.model.title
-        say(f"{config.model} is not the ground's law: {answer.form} took its place")
-    _fill(answer, state, outcome, doubted, cut, before)
-    return Result(answer, state, outcome)
+    if state.named and state.registration is not None and state.registration.displaced:
+        register(state)  # what looked like a displacement may have been a cause that is named by now
+        finish(state, outcome)
+    progress(3, 4, "judging")
+    judge(answer, state, outcome, cut, before)
+    return Result(answer, state)
 
 
-def _fill(
-    answer: Answer,
-    state: State,
-    outcome: Outcome,
-    doubted: dict[str, tuple[float, str]],
-    cut: Cut | None,
-    before: float,
-) -> None:
-    """Doubt what the search found once more, look at what is judged apart, and write all of it into the answer.
-
-    doubted : what was taken back already; cut : what the histogram shows; before : mean square of the residual when nothing was known
-    """
-    view, beside = outcome.view, outcome.beside
-    assert view is not None and beside is not None
-    if again := _mimics_displacement(state):  # what looked like one may have been a cause that is named by now
-        _register(state)
-    if doubted or again:
-        settle(state, beside)
-        doubted |= doubt_all(state, beside, STILL)
-    after = _residual(state)
-    left = outside_catalogue(state) | structure(state, view, cut[1] if cut else 0.0)
-    ordinary = {c.effect.name for c in state.causes} - {c.effect.name for c in state.named}
-    if ordinary:  # rendered to judge the others beside it; from here on the simulation is what is named, and no more
-        before *= after / _without_ordinary(state)
-        doubted |= unconfirmed(state)
-    placed, refused = by_registration(state)
-    clipped = cut[0](state.data, state) if cut else None  # was taken out of the images before anything was sought
-    if clipped:
-        left.pop(PILED, None)
-    ground, shown = by_ground(state)
-    fields, fields_shown = by_images(state)
-    fields, more = by_catalogue(fields)
-    left |= more
-    shaded, extended, contrary = _by_shadows(state)
-    answer.causes = placed + ([clipped] if clipped else []) + by_search(state) + [*shaded] + ground + fields
-    answer.held_out = score(state, answer, extended)
-    # albedo that follows relief, of which nobody is sure, looks like a shift
-    if placed and contradicts(answer.held_out.high):
-        refused |= {c.effect.name: (c.gain, contradiction(answer.held_out.gain, answer.held_out.high)) for c in placed}
-        answer.causes = [c for c in answer.causes if c not in placed]
-        answer.held_out = score(state, answer, extended)
-    rejected = refused | outcome.rejected | doubted | contrary
-    answer.rejected = {
-        k: v for k, v in rejected.items() if k in effect_names() and k not in {c.effect.name for c in answer.causes}
-    }
-    if state.registration is not None:
-        answer.registration = {k: (g.percent, g.low, g.high) for k, g in state.registration.gains.items()}
-    # what a better law or registration took away is no cause where none is named
-    answer.budget = budget(view.rows, view.model, view.grid, before if answer.causes else after, after)
-    answer.structure = left
-    answer.blind = blind_effects(
-        state, outcome, shown | fields_shown | ordinary | {c.effect.name for c in answer.causes}
-    )
-    answer.unexplained_fraction = max(answer.structure.values(), default=0.0)
-    if not answer.causes and outcome.sure:
-        answer.unexplained_fraction = max(answer.unexplained_fraction, 0.01)
-    answer.verdict = _verdict(answer)
+def start(
+    nominal: Nominal,
+    sites: list[Site],
+    hidden: list[Site],
+    reader: PairReader,
+    config: Config,
+    say: Say,
+    progress: Progress,
+) -> State:
+    """The nominal model fitted to the images where they were read, without ground that a wall beyond the DEM darkens."""
+    frames, units = len(reader.image_ids), reader.units
+    read = [s.read for s in sites]
+    fit(nominal, sites, [], units, read, start=True)
+    if not config.law_known:
+        nominal.open_law(sites)
+        fit(nominal, sites, [], units, read, law=True)
+    data, has = survey(sites, frames, units), frozenset({"sun_horizon"})
+    state = State(nominal, sites, data, frames, units, has, config.seed, hidden, say=say, progress=progress)
+    state.leave_out_rare_images()
+    hide_dark(state)
+    return state
 
 
-def _register(state: State) -> None:
-    """Find where the images lie beside the causes that are named so far, lay them there, and fit the nominal model."""
+def register(state: State) -> None:
+    """Find where the images lie beside the causes so far, lay them there, and fit the nominal model."""
     state.registration = explain(state.sites, state.nominal, state.base, state.frames, state.data.elevation[0])
     placed = state.registration.displaced
     for site, known in zip(state.sites, state.registration.known, strict=True):
         site.displacement = known if placed else None
     for site, found in zip(state.hidden, displacements(state, [])[1], strict=True):
         site.displacement = found if placed else None
-    state.fit()
+    state.fit(law=True)
 
 
-def _mimics_displacement(state: State) -> bool:
-    """Whether images are displaced and that has a part of what the named causes do."""
-    if not state.named or state.registration is None or not state.registration.displaced:
-        return False
-    ordinary = [c.effect for c in state.causes if c.ordinary]
-    without = per_site(lambda site: state.nominal.chain(site, ordinary), state.sites)
-    return mimicked_shift(state.chains(), without) > MIMICKED * state.registration.shift_error
-
-
-def _by_shadows(state: State) -> tuple[Sequence[Named], Nominal, dict[str, tuple[float, str]]]:
-    """What shadows tell and the test pairs do not refuse, the nominal model as it is fitted beside that, and what is refused."""
+def judge(answer: Answer, state: State, outcome: Outcome, cut: Cut | None, before: float) -> None:
+    """Decide on the claims of all sources and write everything into the answer; before : mean square of the residual when nothing was known"""
+    after, view = mean_square(state), outcome.view
+    words = in_words(state)
+    claims = [by_clipping(state, cut)] if cut else []
+    claims += [*by_registration(state), *by_ground(state), *by_images(state)]
     for site in state.sites:
         site.show()
-    found, refused = by_shadows(state)
-    return beside_shadows(state, found) if found else ([], state.nominal, refused)
+    claims += by_shadows(state)
+    decided = [(claim, claim.decide()) for claim in claims]
+    found = [claim.named for claim, refusal in decided if refusal is None]
+    words |= {f"{c.effect.title}": c.percent[0] / 100 for c in found if not c.effect.listed}
+    named, answer.ordinary = by_search(state, outcome)
+    answer.causes = _in_order(named, [c for c in found if c.effect.listed])
+    rejected = outcome.refused | {claim.name: refusal for claim, refusal in decided if refusal is not None}
+    there = {c.effect.name for c in [*answer.causes, *answer.ordinary]}
+    answer.rejected = {k: v for k, v in rejected.items() if k in effect_names() and k not in there and _tells(v)}
+    if state.registration is not None:
+        answer.registration = {k: (g.percent, g.low, g.high) for k, g in state.registration.gains.items()}
+    answer.law = state.law
+    answer.budget = budget(view.rows, view.model, view.grid, before, after)
+    answer.structure = words | faults(state, view)
+    if cut and not any(c.effect.name == cut.cls.name for c in answer.causes):
+        answer.structure["brightness that piles up at one level"] = cut.share
+    shown = there | {claim.name for claim in claims if claim.would_show()}
+    answer.blind = blind_effects(state, outcome, shown)
+    answer.unexplained_fraction = max(answer.structure.values(), default=0.0)
+    if not answer.causes and outcome.strange:
+        answer.unexplained_fraction = max(answer.unexplained_fraction, 0.01)
+    answer.verdict = verdict(answer)
+    answer.held_out = score(state, answer, _extended(state, [c for c, refusal in decided if refusal is None]))
 
 
-def _verdict(answer: Answer) -> str:
+def _tells(refusal: Refusal) -> bool:
+    """Whether a refusal is of something that had evidence."""
+    return refusal.gain > 0
+
+
+def _in_order(search: Sequence[Named], others: Sequence[Named]) -> list[Named]:
+    """Displacements and clipping first, which were taken out before anything was sought; then by gain."""
+    first = [c for c in others if c.effect.judged_apart]
+    return [*sorted(first, key=lambda c: -c.gain), *search, *(c for c in others if c not in first)]
+
+
+def _extended(state: State, claims: Sequence[Measured]) -> Nominal:
+    """The nominal model as it is fitted beside all named causes."""
+    more = [c.named.effect for c in claims if not c.named.effect.judged_apart and c.named.effect.scope == "scene"]
+    return state.beside([*(c.effect for c in state.named), *more])
+
+
+def verdict(answer: Answer) -> str:
+    """In one word."""
     if answer.causes:
         return "named"
     if answer.unexplained_fraction:
@@ -274,7 +247,7 @@ def _verdict(answer: Answer) -> str:
     return "cannot_tell" if answer.blind else "nothing_significant"
 
 
-def _load(reader: PairReader, pairs: np.ndarray, config: Config) -> list[Site]:
+def load(reader: PairReader, pairs: np.ndarray, config: Config) -> list[Site]:
     """Sites that share no ground, those that most images show first, from all over the scene."""
     sites: list[Site] = []
     used = 0
@@ -288,44 +261,6 @@ def _load(reader: PairReader, pairs: np.ndarray, config: Config) -> list[Site]:
             sites.append(site)
             used += site.count
     return sites
-
-
-def _residual(state: State) -> float:
-    """Mean square of the relative residual in the windows."""
-    from stages.diagnose.rows.patches import make_patches
-
-    grid, pieces = state.grid()
-    total, count = 0.0, 0.0
-    for k, chain in enumerate(state.chains()):
-        residual = (chain.site.image - chain.predict())[None]
-        if (
-            state.free_gains
-        ):  # relative to the image as it was read: a gain that is fitted too low would blow residuals up
-            residual = residual * _as_read(chain)
-        for patch in make_patches(k, chain, pieces, state.free_gains):
-            z, mean = patch.transform(residual, grid)
-            total += float((z.real.square() + z.imag.square()).sum())
-            area = patch.weight.square().sum((-2, -1))
-            if not patch.free:
-                total += float((mean.square() * area).sum())
-            count += float(area.sum())
-    return total / count if count else math.nan
-
-
-def _without_ordinary(state: State) -> float:
-    """Take what is ordinary out of the model, fit the nominal one again; the mean square of the residual then."""
-    state.causes[:] = state.named
-    state.fit()
-    return _residual(state)
-
-
-def _as_read(chain: Chain) -> torch.Tensor:
-    """(n, 1, 1) by which a residual over the prediction's mean gets one over the read image's mean."""
-    site = chain.site
-    lit = lit_mask(chain).float()
-    count = lit.sum((-2, -1)).clamp(min=1)
-    ratio = (chain.predict() * lit).sum((-2, -1)) / count * site.gain.abs()
-    return (ratio / ((site.read * lit).sum((-2, -1)) / count).clamp(min=1e-9))[:, None, None]
 
 
 def split(reader: PairReader) -> tuple[np.ndarray, np.ndarray]:

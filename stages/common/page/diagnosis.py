@@ -154,6 +154,9 @@ def _cause(cause: dict[str, Any]) -> list[str]:
 
 def _rejected(result: dict[str, Any]) -> list[Markup]:
     parts = []
+    if ordinary := result.get("ordinary"):
+        found = [_cause(c)[:2] for c in ordinary]
+        parts.append(page.table("Surely there, of a size that any data have", ["effect", "parameters"], found))
     rows = [
         [words(r["effect"]), formatted(r.get("gain_nats"), ".0f"), str(r.get("why", "-"))]
         for r in result.get("rejected") or []

@@ -8,13 +8,15 @@ expectation-maximisation (Dempster et al. 1977; factor analysis with known loadi
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from stages.diagnose.rows.patches import Grid, Patch
+from stages.diagnose.likelihood.patches import Grid, Patch, window
+from stages.diagnose.model.chain import Chain
 from stages.diagnose.settings import ADDED, BORROWED, DARKEST, ROUNDS, SECTORS
 
 
@@ -222,4 +224,40 @@ def _means(model: Covariance, patches: Sequence[Patch], means: Sequence[Tensor],
     model.mean_size, model.level = sizes, shared
 
 
-__all__ = ["Covariance", "estimate", "shadow_variance"]
+def kept_share(
+    chains: Sequence[Chain], patches: Sequence[Sequence[Patch]], grid: Grid, frames: int
+) -> Callable[[Tensor], Tensor]:
+    """Share of the DEM's waves, by their number in rad/px, that is relief if all that images show beside it is errors of the DEM.
+
+    A DEM that is off by e predicts shading that is not there, and images show it as relief -e: the rendering is too rough where errors are a
+    good part of the relief (errors in variables: Fuller 1987, Measurement error models).
+    """
+    every: list[Patch] = []
+    left: list[tuple[Tensor, Tensor]] = []
+    for chain, pieces in zip(chains, patches, strict=True):
+        residual = (chain.site.image - chain.rendered)[None]
+        for patch in pieces:
+            z, mean = patch.transform(residual, grid)
+            every.append(patch)
+            left.append((z[0], mean[0]))
+    model = estimate(every, left, grid, frames)
+    total = torch.zeros(grid.annuli, dtype=torch.float64)
+    waves = torch.bincount(grid.annulus, minlength=grid.annuli)
+    taper = window(grid.height, grid.width)
+    along = grid.direction[grid.sector].T
+    for patch in every:
+        here = torch.stack([s[0, patch.rows, patch.columns] for s in chains[patch.site].state.slopes])
+        z = torch.fft.rfft2((here - here.mean((-2, -1), keepdim=True)) * taper).flatten(-2)[:, grid.keep]
+        power = (z * along).sum(0).abs().square().double() / (here[0].numel() * float(taper.square().mean()))
+        total.index_add_(0, grid.annulus, power)
+    dem = total / (waves * max(len(every), 1))
+    share = (1 - model.relief / dem.clamp(min=1e-30)).clamp(0, 1)
+    radius = 2 * np.pi * np.asarray(model.radius)
+
+    def kept(waves: Tensor) -> Tensor:
+        return torch.from_numpy(np.interp(waves.numpy(), radius, share.numpy())).to(waves)
+
+    return kept
+
+
+__all__ = ["Covariance", "estimate", "kept_share", "shadow_variance"]

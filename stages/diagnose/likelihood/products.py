@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from stages.diagnose.likelihood.covariance import Covariance
-from stages.diagnose.rows.patches import Grid, Patch
+from stages.diagnose.likelihood.patches import Grid, Patch
 
 Array = NDArray[np.float64]
 

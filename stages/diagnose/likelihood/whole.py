@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_solve
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
-from stages.diagnose.likelihood.found import Found, interval
-from stages.diagnose.likelihood.jackknife import folds, jackknife_error
+from stages.diagnose.likelihood.columns import Guise, Plan
+from stages.diagnose.likelihood.intervals import folds, jackknife_error
 from stages.diagnose.likelihood.products import Array, Products
-from stages.diagnose.likelihood.solving import cholesky, scaled_to_one, solve
-from stages.diagnose.rows.columns import Guise, Plan
-from stages.diagnose.settings import SIMPLER, UNITS
+from stages.diagnose.settings import UNITS
 from stages.effects import Effect, get_effect
+
+# places of what is fitted, its weights, and places that are excluded
+Fit = tuple[NDArray[np.int64], Array, list[int]]
 
 
 class Whole:
@@ -41,11 +43,6 @@ class Whole:
             self.gram[np.ix_(u.place, u.place)] += u.gram
             self.sham[u.place] += u.sham
             self.sham_squares += u.sham_squares
-        for k, at in plan.pull.items():  # what is known of a coefficient beforehand, as one more observation
-            weight = plan.prior[k] ** -2
-            self.gram[0, 0] += weight * at**2
-            self.gram[0, 1 + k] -= weight * at
-            self.gram[1 + k, 0] -= weight * at
         self.seen = self.gram.diagonal() > 1e-12 * max(self.gram.diagonal().max(), 1e-30)
         self.scattered = np.zeros(0, np.int64)  # places of the gains per frame
         self.precision = self._precision()
@@ -139,10 +136,10 @@ class Whole:
         """Weights that keep at nothing what other ground says nothing of, once all that does is left out."""
         return 1e-6 * self.gram.diagonal()[places]
 
-    def let_scatter(self, places: NDArray[np.int64]) -> None:
-        """Estimate the scatter of nuisance about nothing by expectation-maximisation and make it their prior."""
+    def let_scatter(self, places: NDArray[np.int64], least: float = 1e-4, most: float = math.inf) -> float:
+        """Estimate the scatter of nuisance about nothing by expectation-maximisation, make it their prior, and return it."""
         if not len(places):
-            return
+            return 0.0
         places = np.sort(places)
         spread = 0.3
         for _ in range(8):
@@ -152,10 +149,11 @@ class Whole:
             at = np.searchsorted(n, places)
             scaled, scale = scaled_to_one(self.gram[np.ix_(n, n)] + np.diag(self.weight(n)))
             inverse = np.linalg.inv(scaled) * np.outer(scale, scale)
-            mean = inverse @ self.gram[n, 0]
-            spread = math.sqrt(max(float((mean[at] ** 2 + inverse.diagonal()[at]).mean()), 1e-10))
+            mean = (inverse @ self._score(self.gram, ())[n])[at] + [self.plan.pull.get(int(p) - 1, 0.0) for p in places]
+            spread = min(max(math.sqrt(float((mean**2 + inverse.diagonal()[at]).mean())), least), most)
         for p in places:
-            self.precision[int(p)] = max(spread, 1e-4) ** -2
+            self.precision[int(p)] = spread**-2
+        return spread
 
     def reduce(
         self, places: NDArray[np.int64], exclude: Sequence[int] = ()
@@ -164,14 +162,31 @@ class Whole:
         n = self.nuisance([*places, *exclude])
         a = self.gram[np.ix_(n, n)] + np.diag(self.weight(n))
         scaled, scale = scaled_to_one(a)
-        right = np.concatenate([self.gram[np.ix_(n, places)], self.gram[n, :1], self.sham[n]], 1)
+        first = self._score(self.gram, exclude)
+        right = np.concatenate([self.gram[np.ix_(n, places)], first[n, None], self.sham[n]], 1)
         solved = scale[:, None] * cho_solve(cholesky(scaled), scale[:, None] * right)
         j = len(places)
         cross = self.gram[np.ix_(places, n)]
         information = self.gram[np.ix_(places, places)] - cross @ solved[:, :j]
-        score = self.gram[places, 0] - cross @ solved[:, j]
+        score = first[places] - cross @ solved[:, j]
         shams = self.sham[places] - cross @ solved[:, j + 1 :]
         return (information + information.T) / 2, score, shams, n
+
+    def _without_departures(self, exclude: Sequence[int]) -> Array:
+        """(size,) amounts that take what is rendered of the law's departures away, where these are excluded."""
+        out = np.zeros(self.size)
+        for k in self.plan.form:
+            if 1 + k in exclude:
+                out[1 + k] = -self.plan.pull.get(k, 0.0)
+        return out
+
+    def _score(self, gram: Array, exclude: Sequence[int]) -> Array:
+        """(size,) products of all columns with the residual, without the departures that are excluded, and with the prior of the others."""
+        out = gram[:, 0] - gram @ self._without_departures(exclude)
+        for k, amount in self.plan.pull.items():
+            if 1 + k not in exclude:
+                out[1 + k] -= self.precision.get(1 + k, 0.0) * amount
+        return out
 
     def exclude(self, guise: Guise) -> list[int]:
         """What the nuisance does without beside this effect: ordinary amounts of it, and of all that lights shadows where it does;
@@ -210,6 +225,17 @@ class Whole:
         effect = get_effect(guise.effect)
         return self.levels if effect.scatters and not effect.displaces else None
 
+    def with_added(self, places: NDArray[np.int64], amount: Array) -> Whole:
+        """The sums as if these amounts of columns were in the residual as well."""
+        added = np.zeros(self.size)
+        added[places] = amount
+        out = copy.copy(self)
+        out.units = [dataclasses.replace(u, gram=_added(u.gram, added[u.place])) for u in self.units]
+        out.gram = _added(self.gram, added)
+        out.sizes = np.bincount(self.labels, weights=[u.gram[0, 0] for u in out.units]).astype(np.float64)
+        out.levels = self.levels.with_added(places, amount) if self.levels is not None else None
+        return out
+
     def power(self, places: NDArray[np.int64], amount: Array) -> Array:
         """(labels,) squares of these amounts on every piece of ground, to which what they gain is in proportion but for chance."""
         every = np.zeros(self.size)
@@ -222,22 +248,33 @@ class Whole:
 
         Beside light of its own in every image nothing is left to gain: other ground tells how much that is.
         """
-        n = self.nuisance([*places, *exclude, *self.own_light])
-        every = np.concatenate([n, places])
-        precision = self.weight(n) + self._least(n)
-        more = np.concatenate([precision, np.full(len(places), spread**-2 if spread else 0.0) + self._least(places)])
+        n, gone = self.nuisance([*places, *exclude, *self.own_light]), [int(p) for p in exclude]
+        own = np.full(len(places), spread**-2 if spread else 0.0)
+        full = np.concatenate([n, places]), np.concatenate([self.weight(n), own]), gone
+        return self._gains((n, self.weight(n), gone), full)
+
+    def law_gains(self, exclude: Sequence[int] = ()) -> Array:
+        """(labels,) the same of the law's departures over the nominal law alone."""
+        forms, gone = self.form_places(), [int(p) for p in exclude]
+        n = self.nuisance([*forms, *exclude, *self.own_light])
+        every = np.concatenate([n, forms])
+        return self._gains((n, self.weight(n), [*gone, *forms.tolist()]), (every, self.weight(every), gone))
+
+    def _gains(self, plain: Fit, full: Fit) -> Array:
+        """(labels,) nats by which the second fit predicts ground that it was not fitted to better than the first."""
         out = np.zeros(max(self.labels) + 1)
         for fold in self.folds:
             rest = self.gram.copy()
             for k in fold:
                 u = self.units[k]
                 rest[np.ix_(u.place, u.place)] -= u.gram
-            with_ = solve(rest[np.ix_(every, every)] + np.diag(more), rest[every, 0])
-            without = solve(rest[np.ix_(n, n)] + np.diag(precision), rest[n, 0])
-            b1, b0 = np.zeros(self.size), np.zeros(self.size)
-            b1[every], b0[n] = with_, without
-            for k in fold:
-                out[self.labels[k]] += 0.5 * (_left(self.units[k], b0) - _left(self.units[k], b1))
+            for (places, weights, exclude), sign in ((plain, 0.5), (full, -0.5)):
+                amounts, score = self._without_departures(exclude), self._score(rest, exclude)[places]
+                # what other ground says nothing of stays at nothing
+                weight = np.diag(weights + self._least(places))
+                amounts[places] = solve(rest[np.ix_(places, places)] + weight, score)
+                for k in fold:
+                    out[self.labels[k]] += sign * _left(self.units[k], amounts)
         return out
 
     def without_one(
@@ -264,7 +301,8 @@ class Whole:
             for u, own in zip(self.units, labels, strict=True):
                 if own == label:
                     rest[np.ix_(u.place, u.place)] -= u.gram
-            out.append(solve(rest[np.ix_(every, every)] + more, rest[every, 0] - pulled)[len(n) :])
+            first = self._score(rest, exclude)
+            out.append(solve(rest[np.ix_(every, every)] + more, first[every] - pulled)[len(n) :])
         return np.array(out)
 
     def errors(self, places: NDArray[np.int64], exclude: Sequence[int] = ()) -> tuple[Array, Array, Array]:
@@ -275,39 +313,6 @@ class Whole:
         errors: Array = np.maximum(np.sqrt(np.maximum(inverse.diagonal(), 0)), scatter).astype(np.float64)
         return inverse @ score, errors, inverse.astype(np.float64)
 
-    def another_law(self, guise: Guise | None, surely: bool = False) -> float:
-        """Nats that another form of the reflectance has to add beside an effect of the law, which explains less than most of what
-        that form does alone; 0 where it has not. surely : with a lower bound above zero
-        """
-        added = self.law_adds(guise)
-        if surely and interval(added, self.sizes)[0] <= 0:
-            return 0.0
-        if added.sum() <= 0 or added.sum() < (1 - SIMPLER) * self.law_adds(None).sum():
-            return 0.0
-        return float(added.sum())
-
-    def law_adds(self, guise: Guise | None) -> Array:
-        """(labels,) nats that another form of the reflectance gains on held-out ground, alone or beside an effect of the law."""
-        places = self.places(guise) if guise else np.zeros(0, np.int64)
-        ordinary = self.ordinary_places(guise.effect) if guise else []
-        return self._held_out_beside(places, self.form_places(), [k for k in ordinary if k not in places])
-
-    def gains_beside(self, found: Found, other: Found) -> Array:
-        """(labels,) nats that an effect gains on held-out ground where any amount of another one stands beside it."""
-        return self._held_out_beside(
-            self.places(other.guise), self.places(found.guise), self.exclude(found.guise), found.spread
-        )
-
-    def _held_out_beside(
-        self, free: NDArray[np.int64], places: NDArray[np.int64], exclude: Sequence[int], spread: float = 0.0
-    ) -> Array:
-        """:meth:`held_out` beside any amounts of the columns ``free``."""
-        kept = dict(self.precision)
-        self.precision |= {int(p): 1e-10 * self.gram[p, p] for p in free}
-        gains = self.held_out(places, exclude, spread)
-        self.precision = kept
-        return gains
-
 
 def _integrated_out(u: Products, places: NDArray[np.int64], main: Array, spread: Array) -> Products:
     """The unit without its own amounts, along the directions ``main`` of the columns at ``places``, which scatter by ``spread``."""
@@ -316,9 +321,41 @@ def _integrated_out(u: Products, places: NDArray[np.int64], main: Array, spread:
     return dataclasses.replace(u, gram=u.gram - r.T @ inner @ r, sham=u.sham - r.T @ inner @ sham)
 
 
+def _added(gram: Array, amount: Array) -> Array:
+    """Products where the first column has so much of the others in it as well; gram : (M, M), amount : (M,)"""
+    out = gram.copy()
+    more = gram @ amount
+    out[0, :] += more
+    out[:, 0] += more
+    out[0, 0] += float(amount @ more)
+    return out
+
+
 def _left(unit: Products, b: Array) -> float:
     own = b[unit.place]
     return float(unit.gram[0, 0] - 2 * own @ unit.gram[:, 0] + own @ unit.gram @ own)
+
+
+def scaled_to_one(a: Array) -> tuple[Array, Array]:
+    """A matrix with a diagonal of ones, and by what its rows and columns were multiplied."""
+    scale = 1 / np.sqrt(np.maximum(a.diagonal(), 1e-30))
+    return a * np.outer(scale, scale) + 1e-10 * np.eye(len(a)), scale
+
+
+def cholesky(scaled: Array) -> tuple[Array, bool]:
+    """Cholesky factor; columns that are alike to single precision, in which products are summed, are kept apart by as much as that takes."""
+    for more in (0.0, 1e-7, 1e-6, 1e-5, 1e-4):
+        try:
+            return cho_factor(scaled + more * np.eye(len(scaled)))
+        except LinAlgError:
+            continue
+    return cho_factor(scaled + 1e-2 * np.eye(len(scaled)))
+
+
+def solve(a: Array, b: Array) -> Array:
+    """x of a x = b, for a symmetric positive definite a."""
+    scaled, scale = scaled_to_one(a)
+    return scale * cho_solve(cholesky(scaled), scale * b)
 
 
 __all__ = ["Whole"]

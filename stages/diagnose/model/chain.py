@@ -10,9 +10,9 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from stages.diagnose.model.laws import LunarLaws
+from stages.diagnose.data.sites import Site
+from stages.diagnose.model.laws import Departures
 from stages.diagnose.model.relief import ShareOfRelief, SharpSlopes
-from stages.diagnose.model.sites import Site
 from stages.diagnose.settings import BROAD
 from stages.effects import Effect
 from stages.effects.filters import fine, gradients
@@ -29,7 +29,8 @@ class Chain:
     """Renders a site with the effects named so far (``base``) plus one more.
 
     coefficients : broadcastable to (n, C, H, W); free : those that may move, None for all
-    laws : the directions in which the law may be another one; known : a chain of this site, whose angles and reflectance are taken over where they are the same
+    laws, amounts : directions in which the law may be another one, and how much of each is rendered, (K,)
+    known : a chain of this site, whose angles and reflectance are taken over where they are the same
     """
 
     def __init__(
@@ -39,24 +40,29 @@ class Chain:
         coefficients: Tensor,
         base: Sequence[Effect],
         free: Tensor | None = None,
-        laws: LunarLaws | None = None,
+        laws: Departures | None = None,
+        amounts: Tensor | None = None,
         known: Chain | None = None,
     ) -> None:
         self.site, self.model, self.coefficients, self.base = site, model, coefficients, list(base)
         self.free, self.laws = free, laws
+        self.amounts = amounts if laws is not None and amounts is not None and bool(amounts.any()) else None
         sharp = known._sharp if known else SharpSlopes(site.observation.gsd, site.observation.body_radius)
         self._sharp: SharpSlopes = sharp
         self._state: State = self._illuminate(self.base, known._state if known else None)
         self._tilted: dict[tuple[float, float], Tensor] = {}  # (n, H, W) reflectance at other slopes, by how much
-        self._parts: dict[LunarLaws, Tensor] = {}  # what measured laws are sums of at these angles
-        alike = known is not None and known.model is model and torch.equal(known.coefficients, coefficients)
+        self._parts: Tensor | None = None  # of the laws' directions at these angles
         here = known is not None and self._state.angles is known._state.angles
-        if known is not None and here:
+        alike = known is not None and known.model is model and torch.equal(known.coefficients, coefficients)
+        if known is not None and here and known.laws is laws:
             self._parts = known._parts
-        if known is not None and alike and here:
+            alike &= (known.amounts is None) == (self.amounts is None)
+            if alike and known.amounts is not None and self.amounts is not None:
+                alike = torch.equal(known.amounts, self.amounts)
+        else:
+            alike = False
+        if known is not None and alike:
             self._state.reflectance, self._tilted = known._state.reflectance, known._tilted
-        elif isinstance(model, LunarLaws) and model in self._parts:
-            self._state.reflectance = torch.tensordot(coefficients[0, :, 0, 0], self._parts[model], 1)
         else:
             self._state.reflectance = self._surface(self._state)
         self.rendered = self.render()
@@ -70,8 +76,14 @@ class Chain:
         return formation.illuminate(self.site.observation, [self._sharp, *effects], known)
 
     def _surface(self, state: State, coefficients: Tensor | None = None) -> Tensor:
+        """(n, H, W) I/F of the law, without what else lights the ground."""
         c = self.coefficients if coefficients is None else coefficients
-        return masked_radiance_factor(self.model, self.model.unpack(c, dim=1), state.angles)
+        out = masked_radiance_factor(self.model, self.model.unpack(c, dim=1), state.angles)
+        if self.laws is None or self.amounts is None:
+            return out
+        if state is self._state and self._parts is not None:
+            return out + torch.tensordot(self.amounts, self._parts, 1)
+        return out + self.laws.added(self.amounts, state.angles)
 
     def _expose(
         self, state: State, reflectance: Tensor, effects: Sequence[formation.Extension], measured: bool = True
@@ -141,42 +153,24 @@ class Chain:
     def surface_tangents(self) -> list[Tensor]:
         """d image / d coefficient, one (n, H, W) per free coefficient: the nominal model's own freedom."""
         columns: list[Tensor] = []
-        reflectance = self._state.reflectance
-        parts = self._parts_of(self.model) if isinstance(self.model, LunarLaws) else None
         for k in range(self.coefficients.shape[1]):
             if self.free is not None and not bool(self.free[k]):
                 continue
-            size = float(self.coefficients[:, k].abs().mean())
-            if parts is None:
-                step = 0.05 * size + 1e-4
-                c = self.coefficients.clone()
-                c[:, k] += step
-                moved = self._surface(self._state, c)
-            else:  # a sum of parts, of which 1 is the mean law: a small step would drown in rounding
-                step = 0.05 * max(size, 1.0)
-                moved = reflectance + step * parts[k]
+            step = 0.05 * float(self.coefficients[:, k].abs().mean()) + 1e-4
+            c = self.coefficients.clone()
+            c[:, k] += step
+            moved = self._surface(self._state, c)
             columns.append((self._expose(self._state, moved, self.base) - self.rendered) / step)
         return columns
 
-    def _parts_of(self, laws: LunarLaws) -> Tensor:
-        """(C, n, H, W) I/F that a coefficient of 1 adds to facets that face the Sun and the camera; kept for one law, and for chains of the same angles."""
-        if laws not in self._parts:
-            angles = self._state.angles
-            facing = (angles.cos_incidence > 0) & (angles.cos_emission > 0)
-            self._parts.clear()
-            self._parts[laws] = torch.where(facing, laws.parts(angles), 0.0)
-        return self._parts[laws]
-
     def form_tangents(self) -> list[Tensor]:
-        """What another law of the ground adds, (n, H, W) for a standard deviation in each direction in which measured laws differ."""
-        if self.laws is None or isinstance(self.model, LunarLaws):
+        """What another law of the ground adds, (n, H, W) for an amount of 1 in each direction in which measured laws differ."""
+        if self.laws is None:
             return []
-        out = []
-        parts = self._parts_of(self.laws)
-        for part, size in zip(parts[1:], self.laws.scatter[1:], strict=True):
-            more = self._state.reflectance * (part / parts[0].clamp(min=1e-9) * size)
-            out.append(self._expose(self._state, self._state.reflectance + more, self.base) - self.rendered)
-        return out
+        if self._parts is None:
+            self._parts = self.laws.parts(self._state.angles)
+        plain = self._state.reflectance
+        return [self._expose(self._state, plain + part, self.base) - self.rendered for part in self._parts]
 
     @cached_property
     def slope_tangents(self) -> tuple[Tensor, Tensor]:

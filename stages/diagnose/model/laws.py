@@ -1,14 +1,13 @@
-"""Which laws the ground of the Moon may have: a mean law, and the few ways in which measured ones differ from it at the angles at hand.
+"""The ways in which the law of the ground may differ from the nominal one, at the angles at hand.
 
-Laws with parameters drawn over what has been published of them are evaluated at angles of the data. Their mean and the main directions
-of their scatter (principal components) make a linear law whose coefficients have known standard deviations: what no measured law does
-costs likelihood, so that a wrong Sun or DEM is not taken for a peculiar law.
+Laws are drawn with parameters over their published ranges and evaluated at angles of the data. The nominal law is fitted to each. The main
+directions of what it leaves (principal components) are open in the model, with the scatter of measured laws as their prior.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -17,8 +16,7 @@ from torch import Tensor
 
 from stages.common.arrays import Floats
 from stages.physics.formation.geometry import Angles
-from stages.physics.photometry import Parameter, ReflectanceModel, get_model
-from stages.physics.photometry.base import horizon_cosine
+from stages.physics.photometry import ReflectanceModel, get_model
 from stages.physics.photometry.roughness import roughness_factor
 
 DRAWS = 360  # laws: the scatter of a direction is known to a tenth
@@ -36,35 +34,29 @@ TERMS: list[Term] = [
 SIMPLE = [n for n, term in enumerate(TERMS) if sum(term) <= ROUGH_DEGREE]
 
 
-class LunarLaws(ReflectanceModel):
-    """Lommel-Seeliger's law times polynomials: ``level`` times the mean law, and an amount of each direction.
+class Departures:
+    """What other laws add to the nominal one: Lommel-Seeliger's law times polynomials of the angles, one for each direction.
 
-    scatter : (C,) standard deviations of the coefficients among measured laws, that of the level infinite
+    An amount of 1 is one standard deviation among measured laws. weights : (K, terms); low, high : (3,) range of the factors' arguments
     """
 
-    name = "lunar_laws"
-    title = "measured lunar laws"
-    formula = "mean of measured lunar laws, and the main directions of their scatter"
-    reference = "Hapke (2012), Akimov (1976), Minnaert (1941), McEwen (1996), LROC team (2014, 2019)"
-    reciprocal = False
-    linear = True
-
-    def __init__(self, low: Floats, high: Floats, weights: Floats, scatter: Floats) -> None:
+    def __init__(self, low: Floats, high: Floats, weights: Floats) -> None:
         self.low, self.high = low, high
         self.weights = torch.from_numpy(weights).float()
-        self.scatter = torch.from_numpy(np.concatenate([[math.inf], scatter])).float()
-        directions = [f"direction {k + 1}" for k in range(len(scatter))]
-        self.parameters = tuple(  # type: ignore[misc]
-            Parameter(name, "1", -1.0, 2.0, default, "of the law")
-            for name, default in [("level", 1.0), *((name, 0.0) for name in directions)]
-        )
+
+    def __len__(self) -> int:
+        return len(self.weights)
 
     def parts(self, angles: Angles) -> Tensor:
-        """(C, ...) I/F that a coefficient of 1 adds, over the shape of the angles, for each coefficient."""
+        """(K, ...) I/F that an amount of 1 in each direction adds, where facets face the Sun and the camera."""
         return self._sums(self.weights, angles) * _seeliger(angles)
 
+    def added(self, amounts: Tensor, angles: Angles) -> Tensor:
+        """(...) I/F that these amounts (K,) add."""
+        return self._sums(amounts[None].to(self.weights) @ self.weights, angles)[0] * _seeliger(angles)
+
     def _sums(self, weights: Tensor, angles: Angles) -> Tensor:
-        """(R, ...) sums of all terms, weighted by (R, terms); so many pixels at a time as a processor's own memory holds."""
+        """(R, ...) sums of all terms, weighted by (R, terms), in blocks of pixels that fit into a processor's cache."""
         shape = angles.cos_incidence.shape
         every = [x.expand(shape).flatten() for x in (angles.cos_incidence, angles.cos_emission, angles.cos_phase)]
         out = torch.empty(len(weights), len(every[0]), dtype=every[0].dtype)
@@ -76,27 +68,18 @@ class LunarLaws(ReflectanceModel):
             )
         return out.unflatten(1, shape)
 
-    def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
-        """I/F (...,) of the law with these coefficients."""
-        amounts = [torch.as_tensor(parameters[p.name]) for p in self.parameters]
-        if any(a.numel() > 1 for a in amounts):
-            return torch.stack([a * part for a, part in zip(amounts, self.parts(angles), strict=True)]).sum(0)
-        weights = torch.stack([a.flatten()[0] for a in amounts]).to(self.weights.dtype) @ self.weights
-        return self._sums(weights[None], angles)[0] * _seeliger(angles)
-
 
 def _seeliger(angles: Angles) -> Tensor:
-    """(...) of Lommel and Seeliger's law, facets at the horizon kept apart from zero."""
-    floor = horizon_cosine(angles.cos_incidence.dtype)
-    mu0, mu = angles.cos_incidence.clamp(min=floor), angles.cos_emission.clamp(min=floor)
-    return mu0 / (mu0 + mu)
+    """(...) of Lommel and Seeliger's law, 0 where a facet is not lit or not seen."""
+    facing = (angles.cos_incidence > 0) & (angles.cos_emission > 0)
+    return torch.where(facing, angles.cos_incidence / (angles.cos_incidence + angles.cos_emission).clamp(min=1e-6), 0.0)
 
 
-def lunar_laws(cosines: Tensor, brightness: float | None = None) -> LunarLaws:
-    """The laws at these angles.
+def departures(model: ReflectanceModel, vector: Tensor, cosines: Tensor) -> Departures:
+    """The directions in which measured lunar laws differ from the nominal one, once its coefficients are fitted to each of them.
 
+    vector : (C,) coefficients about which a curved model is linearised
     cosines : (3, N) of incidence, emission and phase, all facets lit and seen
-    brightness : mean I/F at a level of 1; that of the mean law where None
     """
     here = cosines.double()
     at = torch.stack([here[0], here[1], Angles(*here).phase.sqrt()])
@@ -107,14 +90,32 @@ def lunar_laws(cosines: Tensor, brightness: float | None = None) -> LunarLaws:
     laws = _draw(angles)
     laws = laws / laws[:, known].mean(1, keepdims=True)
     mean = laws.mean(0)
-    sizes, axes = _main_directions(laws / mean - 1, here.shape[1])
-    seeliger = (angles.cos_incidence / (angles.cos_incidence + angles.cos_emission)).numpy()
-    shapes = np.concatenate([np.ones((1, len(mean))), axes * math.sqrt(here.shape[1])]) * mean / seeliger
-    shapes *= (brightness or 0.06) / mean[known].mean()
+    tangents = _tangents(model, vector.double(), angles)
+    basis = tangents / mean
+    fitted = np.linalg.lstsq(basis[:, known].T, (laws / mean)[:, known].T, rcond=1e-9)[0]
+    sizes, axes = _main_directions(laws / mean - fitted.T @ basis, here.shape[1])
+    shapes = axes * (sizes[:, None] * math.sqrt(here.shape[1])) * mean * tangents[0, known].mean()
+    seeliger = _seeliger(angles).numpy()
     terms = _terms(_factors(angles, low, high)).numpy()
-    # by what is wrong with brightness, since at grazing light laws go apart without bound
-    weights = np.linalg.lstsq((terms * seeliger).T, (shapes * seeliger).T, rcond=1e-10)[0].T
-    return LunarLaws(low, high, weights, sizes)
+    # by what is wrong with brightness, since laws differ without bound at grazing light
+    weights = np.linalg.lstsq((terms * seeliger).T, shapes.T, rcond=1e-10)[0].T
+    return Departures(low, high, weights)
+
+
+def _tangents(model: ReflectanceModel, vector: Tensor, angles: Angles) -> Floats:
+    """(1 + C, N) I/F of the nominal law, and what a small step of each coefficient adds to it."""
+
+    def law(coefficients: Tensor) -> Tensor:
+        return model.radiance_factor(model.unpack(coefficients[None, :, None], dim=1), angles)[0]
+
+    first = law(vector)
+    out = [first]
+    for k, size in enumerate(vector.abs()):
+        moved = vector.clone()
+        step = 0.05 * float(size) + 1e-4
+        moved[k] += step
+        out.append((law(moved) - first) / step)
+    return torch.stack(out).double().numpy()
 
 
 def _between(low: Floats, high: Floats, count: int) -> Tensor:
@@ -244,4 +245,4 @@ def _draw(angles: Angles) -> Floats:
     return np.stack([kinds[k % len(kinds)]() for k in range(DRAWS)])
 
 
-__all__ = ["LunarLaws", "lunar_laws"]
+__all__ = ["Departures", "departures"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -12,11 +13,11 @@ import torch
 from torch import Tensor
 
 from schemas.errors import ArtefactError, RegistryError
+from stages.diagnose.data.parallel import per_site
+from stages.diagnose.data.sites import Site
 from stages.diagnose.model.chain import Chain
-from stages.diagnose.model.laws import LunarLaws
-from stages.diagnose.model.parallel import per_site
-from stages.diagnose.model.sampled import sampled_fit
-from stages.diagnose.model.sites import Site
+from stages.diagnose.model.laws import Departures, departures
+from stages.diagnose.model.sampled import draw, sampled_fit
 from stages.diagnose.settings import CORRELATED, GRAZING, LIT_MARGIN
 from stages.effects import Effect
 from stages.physics.photometry import ReflectanceModel, get_model
@@ -26,19 +27,48 @@ PULL = 0.05
 SETTLED = 3e-4  # of the squared residual: a step that lowers it by less is the last
 DAMPING = 0.1  # at first: the coefficients of a curved model imitate each other
 DARK = 0.3  # of the predicted brightness
+LEAST_SCATTER, MOST_SCATTER = (
+    0.05,
+    1.0,
+)  # of the law's departures, in those of measured laws: more than these no ground is expected to have
 BETWEEN = 0.03  # of a site's own level that the law answers for: the rest is the albedo of the ground, which differs from place to place by far more
 
 
 @dataclass
 class Nominal:
-    """``vector`` (C,) scales maps (checkpoint) or is the set itself (fitted); ``free`` (C,) bool is what a fit may move."""
+    """``vector`` (C,) scales maps (checkpoint) or is the set itself (fitted); ``free`` (C,) bool is what a fit may move.
+
+    laws, amounts, scatter : directions in which the law may be another one, how much of each is fitted, (K,), and their estimated standard
+        deviation, where measured lunar laws have 1
+    maps : of every site, what the network says
+    """
 
     model: ReflectanceModel
     vector: Tensor
     free: Tensor
     predictor: Any = None
-    laws: LunarLaws | None = None  # the directions in which the law may be another one
-    maps: dict[int, Tensor] = field(default_factory=dict)  # what the network says of each site
+    laws: Departures | None = None
+    amounts: Tensor = field(default_factory=lambda: torch.zeros(0))
+    scatter: float = 1.0
+    maps: dict[int, Tensor] = field(default_factory=dict)
+
+    @property
+    def departs(self) -> bool:
+        """Whether departures of the law are fitted and rendered: of a fitted sum of terms. A physical law keeps its own freedom."""
+        return self.laws is not None and self.predictor is None and self.model.linear and bool(self.free.all())
+
+    def alone(self) -> Nominal:
+        """A copy without departures."""
+        return dataclasses.replace(self, amounts=torch.zeros_like(self.amounts))
+
+    def open_law(self, sites: Sequence[Site]) -> None:
+        """Add the directions in which measured lunar laws differ from this one at the angles of these sites."""
+        chains = per_site(lambda site: self.chain(site, []), sites)
+        cosines, _, measured = draw(chains, [lit_mask(c) for c in chains], [s.image for s in sites])
+        if len(measured):
+            vector = self.vector if self.predictor is None else self.coefficients(sites[0]).mean((0, 2, 3))
+            self.laws = departures(self.model, vector, cosines.flatten(1))
+            self.amounts = torch.zeros(len(self.laws))
 
     def coefficients(self, site: Site) -> Tensor:
         """(1 or n, C, 1 or H, 1 or W)"""
@@ -52,7 +82,7 @@ class Nominal:
     def chain(self, site: Site, base: Sequence[Effect]) -> Chain:
         """The formation chain of one site with these effects."""
         free = self.free if self.predictor is None else None  # maps may still drift
-        site.latest = Chain(site, self.model, self.coefficients(site), base, free, self.laws, site.latest)
+        site.latest = Chain(site, self.model, self.coefficients(site), base, free, self.laws, self.amounts, site.latest)
         return site.latest
 
 
@@ -103,14 +133,17 @@ def fit(
     measured: Sequence[Tensor],
     most: int = ROUNDS,
     start: bool = False,
+    law: bool = False,
 ) -> None:
     """Least squares of the coefficients (and of gain and offset per pair where images are in dn), in place.
 
     measured : the images as read, one (n, H, W) per site; ``site.image`` becomes I/F
     most : rounds at most; one is enough for a linear model that was fitted to nearly the same before
-    start : nothing is known of the coefficients yet
+    start : nothing is known of the coefficients yet; law : whether departures of the law are fitted as well
     """
     fitted = nominal.predictor is None
+    if start:
+        nominal.amounts = torch.zeros_like(nominal.amounts)
     if fitted and not nominal.model.linear and start:
         chains = per_site(lambda site: nominal.chain(site, base), sites)
         nominal.vector = sampled_fit(
@@ -126,7 +159,7 @@ def fit(
     rounds = min((ROUNDS if units == "dn" or not nominal.model.linear else 3) if fitted else int(units == "dn"), most)
     if not fitted or nominal.model.linear:
         for _ in range(rounds):
-            gram, score, cost, count = _normal_equations(nominal, sites, base, units, measured, fitted)
+            gram, score, cost, count = _normal_equations(nominal, sites, base, units, measured, fitted, law)
             _drawn_to_measured(nominal, gram, score, cost)
             if (
                 fitted
@@ -151,7 +184,7 @@ def fit(
 
 
 def _step(nominal: Nominal, gram: Tensor, score: Tensor, damping: float) -> float:
-    """Move the free coefficients by a damped step; returns by how much it lowers the sum of squares, to first order."""
+    """Move the free coefficients, and the departures of the law, by a damped step; returns by how much it lowers the sum of squares, to first order."""
     felt = gram.diagonal() > 1e-12 * gram.diagonal().max()  # a width without its amplitude changes nothing
     low = torch.tensor([p.lower for p in nominal.model.parameters])[nominal.free]
     high = torch.tensor([p.upper for p in nominal.model.parameters])[nominal.free]
@@ -163,10 +196,12 @@ def _step(nominal: Nominal, gram: Tensor, score: Tensor, damping: float) -> floa
     scale = gram.diagonal()[felt].rsqrt()
     normal = gram[felt][:, felt] * scale[:, None] * scale + damping * torch.eye(len(scale), dtype=torch.float64)
     move = torch.linalg.solve(normal, score[felt] * scale) * scale
-    moved = at.clone()
-    moved[felt] += move.float()
+    moves = torch.zeros(len(gram))
+    moves[felt] = move.float()
+    moved = at + moves[: len(at)]
     nominal.vector = nominal.vector.clone()
     nominal.vector[nominal.free] = moved if nominal.model.linear else moved.clamp(min=low, max=high)
+    nominal.amounts = nominal.amounts + moves[len(at) :] if len(moves) > len(at) else nominal.amounts
     return float(score[felt] @ move)
 
 
@@ -177,9 +212,10 @@ def _normal_equations(
     units: str,
     measured: Sequence[Tensor],
     fitted: bool,
+    law: bool = False,
 ) -> tuple[Tensor, Tensor, float, float]:
     """Gram matrix and score of the coefficients (zero unless ``fitted``), the mean squared residual, its pixels."""
-    count_free = int(nominal.free.sum())
+    count_free = int(nominal.free.sum()) + (len(nominal.amounts) if law and nominal.departs else 0)
     gram = torch.zeros(count_free, count_free, dtype=torch.float64)
     score = torch.zeros(count_free, dtype=torch.float64)
     cost, count = 0.0, 0.0
@@ -205,7 +241,8 @@ def _normal_equations(
         residual = residual.flatten()
         flat = residual.new_zeros(count_free, len(residual) if fitted else 1)
         if fitted:
-            flat = (torch.stack(chain.surface_tangents()) * weight).flatten(1)
+            columns = chain.surface_tangents() + (chain.form_tangents() if law and nominal.departs else [])
+            flat = (torch.stack(columns) * weight).flatten(1)
             if units == "iof" and int(site.counts.sum()) > 1:
                 common = torch.nn.functional.normalize((predicted * weight).flatten(), dim=0)
                 residual, flat = (x - (1 - BETWEEN) * (x @ common)[..., None] * common for x in (residual, flat))
@@ -238,11 +275,12 @@ def _drawn_to_published(nominal: Nominal, gram: Tensor, score: Tensor, cost: flo
 
 
 def _drawn_to_measured(nominal: Nominal, gram: Tensor, score: Tensor, cost: float) -> None:
-    """Add what is known of the coefficients of lunar laws to the normal equations."""
-    if isinstance(nominal.model, LunarLaws):
-        pull = cost * CORRELATED * nominal.model.scatter[nominal.free].double() ** -2
-        gram += torch.diag(pull)
-        score -= pull * nominal.vector[nominal.free].double()
+    """Add the prior of the law's departures to the normal equations."""
+    count = len(nominal.amounts)
+    if len(gram) > int(nominal.free.sum()):
+        pull = cost * CORRELATED * nominal.scatter**-2
+        gram[-count:, -count:] += pull * torch.eye(count, dtype=torch.float64)
+        score[-count:] -= pull * nominal.amounts.double()
 
 
 def _brightness(chains: Sequence[Chain], masks: Sequence[Tensor]) -> float:
@@ -279,3 +317,24 @@ def scale_images(site: Site, raw: Tensor, predicted: Tensor, mask: Tensor) -> No
     site.gain = gain.float()
     site.offset = torch.where(usable, my - gain * mx, 0.0).float()
     site.image = ((raw - site.offset[:, None, None]) / site.gain[:, None, None]).float()
+
+
+def relative_misfit(nominal: Nominal, sites: Sequence[Site], varied: bool = False, whole: bool = False) -> float:
+    """rms residual over the mean brightness of lit pixels; ``whole``: over the rms of the images (``varied``: their means taken out)."""
+
+    def of(site: Site) -> tuple[float, float, float]:
+        chain = nominal.chain(site, [])
+        mask = lit_mask(chain)
+        left = ((site.image - chain.predict()) * mask).double()
+        light = (site.image * mask).double()
+        if varied:
+            level = light.sum((-2, -1)) / mask.sum((-2, -1)).clamp(min=1)
+            light = (light - level[:, None, None]) * mask
+            size = site.gain[:, None, None].abs().double()  # as read: a gain fitted too low would blow both up
+            left, light = left * size, light * size
+        return float(left.square().sum()), float(light.square().sum() if whole else light.sum()), float(mask.sum())
+
+    left, light, count = (sum(x) for x in zip(*per_site(of, sites), strict=True))
+    if count == 0 or light <= 0:
+        return math.inf
+    return math.sqrt(left / light) if whole else math.sqrt(left / count) / (light / count)

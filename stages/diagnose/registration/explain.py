@@ -10,18 +10,18 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from stages.diagnose.likelihood.jackknife import gain_interval, jackknife_error
+from stages.diagnose.data.parallel import per_site
+from stages.diagnose.data.sites import Site
+from stages.diagnose.likelihood.intervals import gain_interval, jackknife_error
+from stages.diagnose.likelihood.patches import cuts
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.nominal import Nominal
-from stages.diagnose.model.parallel import per_site
-from stages.diagnose.model.sites import Site
 from stages.diagnose.registration.forms import FORMS, TERMS, Form, Frame, Matched, displacement, solve
 from stages.diagnose.registration.lines import STEADY, TREMBLING, Lines, lines
 from stages.diagnose.registration.own import beside, match_all, own_fields
 from stages.diagnose.registration.registered import Gain, Registration, shifted_frames
 from stages.diagnose.registration.squares import OWN, compared, grounds, held_out, shown_once
 from stages.diagnose.registration.start import start
-from stages.diagnose.rows.patches import cuts
 from stages.diagnose.settings import CORRELATED, PATCH, SURE
 from stages.effects import Effect
 from stages.effects.misregistration import ORDINARY as USUAL_SHIFT

@@ -13,9 +13,9 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from stages.diagnose.model.aligned import aligned
+from stages.diagnose.data.aligned import aligned
+from stages.diagnose.data.sites import Site
 from stages.diagnose.model.chain import Chain
-from stages.diagnose.model.sites import Site
 from stages.diagnose.settings import BROAD, CONTRAST, FIELD_ORDER
 from stages.effects.filters import fine, gradients
 from stages.effects.relief_displacement import lean

@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from stages.common.intervals import student_quantile
-from stages.diagnose.likelihood.jackknife import jackknife_error
+from stages.diagnose.data.parallel import per_site
+from stages.diagnose.data.sites import Site
+from stages.diagnose.likelihood.intervals import jackknife_error
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.nominal import full_light
-from stages.diagnose.model.parallel import per_site
-from stages.diagnose.model.sites import Site
 from stages.diagnose.registration.forms import asked
 from stages.diagnose.registration.start import Field
 from stages.diagnose.settings import CAPTURE, ROUNDS

@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from stages.diagnose.data.parallel import per_site
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.nominal import full_light
-from stages.diagnose.model.parallel import per_site
 from stages.diagnose.registration.forms import Frame, Matched, displacement, match
 from stages.diagnose.registration.squares import left
 from stages.diagnose.registration.start import Field, captured, laid

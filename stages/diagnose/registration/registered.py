@@ -4,23 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from stages.diagnose.likelihood.jackknife import gain_chance, gain_interval, nats
+from stages.diagnose.data.sites import Site
+from stages.diagnose.likelihood.intervals import chance
 from stages.diagnose.model.chain import Chain
-from stages.diagnose.model.nominal import Nominal
-from stages.diagnose.model.sites import Site
-from stages.diagnose.registration.forms import FORMS, Form, Frame, displacement
-from stages.diagnose.registration.lines import STEADY, TREMBLING, Lines, lines
-from stages.diagnose.registration.own import match_all, own_fields
-from stages.diagnose.registration.squares import OWN, left
+from stages.diagnose.registration.forms import Form, Frame
+from stages.diagnose.registration.lines import Lines, lines
+from stages.diagnose.registration.own import own_fields
 from stages.diagnose.registration.start import Field
-from stages.diagnose.settings import CORRELATED, DISCOVERY
+from stages.diagnose.settings import DISCOVERY
 from stages.effects.relief_displacement import lean
 
 
@@ -41,7 +39,7 @@ class Registration:
     coefficients : (frames, 2, T), px; share : of the relief displacement; gains : of each form over nothing
     fitted : coefficients and share of every form; without : coefficients by all ground but one piece, of the form and of constant ones
     squares : of the residual, (pieces of ground, frames) for every form, in OWN without and with relief displacement, in STEADY and TREMBLING without
-    and with what other samples say of a line; tested : of the test pairs
+    and with what other samples say of a line
     """
 
     form: Form
@@ -59,7 +57,6 @@ class Registration:
     pixels: float
     fitted: dict[str, tuple[Tensor, float]]
     without: dict[str, list[Tensor]]
-    tested: dict[str, NDArray[np.float64]] = field(default_factory=dict)
 
     @property
     def displaced(self) -> bool:
@@ -70,61 +67,6 @@ class Registration:
     def lines_tremble(self) -> bool:
         """Whether lines are surely shifted against each other, and by more than is ordinary."""
         return self.gains["lines"].low > 0 and not self.lines.ordinary
-
-    def test(self, sites: Sequence[Site], nominal: Nominal) -> None:
-        """Squares of every form on ground that nothing was fitted to, into ``tested``: relief displacement beside each image's own field."""
-        if not sites:
-            return
-        chains = [nominal.chain(s, []) for s in sites]
-        known = [self.at(c) for c in chains]
-        matched = match_all(chains, known, self.frame, self.level, 1)
-        fields = {f.name: [displacement(m, *self.fitted[f.name]) for m in matched] for f in FORMS}
-        fields |= {n: self.settled(chains, share, 1) for n, share in zip(OWN, (0.0, self.share), strict=True)}
-        if self.lines_tremble:
-            fields[STEADY] = fields[OWN[self.form.leaning]]
-            fields[TREMBLING] = lines(chains, fields[STEADY], self.lines.variance).across
-        for k, m in enumerate(matched):
-            for name, (squares,) in zip(fields, left([m], [f[k] for f in fields.values()]), strict=True):
-                total = self.tested.setdefault(name, np.zeros((len(sites), len(self.coefficients))))
-                np.add.at(total[k], m.chain.site.frames, squares)
-
-    def doubt(self, first: str, second: str, tested: tuple[str, str], frames: NDArray[np.int64] | None = None) -> str:
-        """Why the second form's gain over the first is not sure, with the test pairs' part in it; ''. frames : that count, all where None"""
-        learned = shown(*(of_frames(self.squares[name], frames) for name in (first, second)))
-        low, high = gain_interval(*learned)[1:]
-        if not low > 0:
-            return f"no sure gain on held-out ground (95 %: {low:.0f} .. {high:.0f} %)"
-        if not self.tested:
-            return ""
-        before, after = shown(*(of_frames(self.tested[t], frames) for t in tested))
-        if not before.sum() > 0:
-            return ""
-        part, low, high = gain_interval(before, after)
-        if high < 0 or (math.isnan(high) and after.sum() > before.sum()):
-            return f"the test pairs contradict it: it gains {100 * (1 - after.sum() / before.sum()):.0f} % there"
-        # what one comparison gains there counts with the rest of the held-out ground
-        both = [np.concatenate(pair) for pair in zip(learned, (before, after), strict=True)]
-        part, low, high = gain_interval(*both)
-        return (
-            ""
-            if low > 0
-            else f"no sure gain on held-out ground once the test pairs count as well ({part:.0f} %; 95 %: {low:.0f} .. {high:.0f})"
-        )
-
-    def evidence(self, first: str, second: str, frames: NDArray[np.int64] | None = None) -> tuple[float, float, float]:
-        """Chance of the second form's gain over the first where there is none, the gain in nats, and its error."""
-        before, after = shown(of_frames(self.squares[first], frames), of_frames(self.squares[second], frames))
-        gain = Gain(*gain_interval(before, after))
-        pixels = self.pixels * float(before.sum()) / float(self.squares[first].sum())
-        total = nats(float(before.sum()), float(after.sum()), pixels, CORRELATED)
-        error = abs(total) * (gain.high - gain.low) / (4 * max(abs(gain.percent), 1e-9))
-        return gain_chance(before, after), total, error
-
-    def gain(self, first: str, second: str, frames: NDArray[np.int64] | None = None) -> Gain:
-        """Of the second form over the first, as a share of the squared residual of all images."""
-        before, after = shown(of_frames(self.squares[first], frames), of_frames(self.squares[second], frames))
-        share = float(before.sum() / self.squares[first].sum())
-        return Gain(*(share * g for g in gain_interval(before, after)))
 
     def at(self, chain: Chain) -> Field:
         """Where the form has the images of any site look, (n, H, W) px each."""
@@ -158,11 +100,17 @@ def shifted_frames(before: NDArray[np.float64], after: NDArray[np.float64]) -> N
     """Frames whose squares (pieces of ground, frames) surely get smaller on the ground that shows them; false ones are as rare as the
     false discovery rate has it (Benjamini & Hochberg 1995).
     """
-    chance = np.array([gain_chance(*shown(b, a)) for b, a in zip(before.T, after.T, strict=True)])
-    chance = np.where(np.isfinite(chance), chance, 1.0)
-    order = np.argsort(chance)
-    passed = np.flatnonzero(chance[order] <= DISCOVERY * np.arange(1, len(order) + 1) / len(order))
+    chances = np.array([_chance(b, a) for b, a in zip(before.T, after.T, strict=True)])
+    chances = np.where(np.isfinite(chances), chances, 1.0)
+    order = np.argsort(chances)
+    passed = np.flatnonzero(chances[order] <= DISCOVERY * np.arange(1, len(order) + 1) / len(order))
     return np.sort(order[: passed.max() + 1]) if len(passed) else np.zeros(0, np.int64)
+
+
+def _chance(before: NDArray[np.float64], after: NDArray[np.float64]) -> float:
+    """Of such a gain of one frame where there is none."""
+    shown = before > 0
+    return chance((before - after)[shown], before[shown])
 
 
 def of_frames(squares: NDArray[np.float64], frames: NDArray[np.int64] | None) -> NDArray[np.float64]:
@@ -170,9 +118,4 @@ def of_frames(squares: NDArray[np.float64], frames: NDArray[np.int64] | None) ->
     return squares.sum(1) if frames is None else squares[:, frames].sum(1)
 
 
-def shown(before: NDArray[np.float64], after: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Of the pieces of ground that show anything."""
-    return before[before > 0], after[before > 0]
-
-
-__all__ = ["Gain", "Registration", "shifted_frames"]
+__all__ = ["Gain", "Registration", "of_frames", "shifted_frames"]

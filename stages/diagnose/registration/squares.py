@@ -10,12 +10,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from stages.diagnose.likelihood.jackknife import folds
-from stages.diagnose.model.aligned import aligned
+from stages.diagnose.data.aligned import aligned
+from stages.diagnose.data.parallel import per_site
+from stages.diagnose.data.sites import Site
+from stages.diagnose.likelihood.intervals import folds
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.nominal import full_light
-from stages.diagnose.model.parallel import per_site
-from stages.diagnose.model.sites import Site
 from stages.diagnose.registration.forms import FORMS, Matched, displacement, solve
 from stages.diagnose.registration.start import Field
 

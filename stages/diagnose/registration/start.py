@@ -8,11 +8,11 @@ from contextlib import contextmanager
 import torch
 from torch import Tensor
 
-from stages.diagnose.model.aligned import aligned
+from stages.diagnose.data.aligned import aligned
+from stages.diagnose.data.parallel import per_site
+from stages.diagnose.data.sites import Site
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.nominal import lit_mask
-from stages.diagnose.model.parallel import per_site
-from stages.diagnose.model.sites import Site
 from stages.diagnose.registration.capture import contrast, correlations, peak
 from stages.diagnose.settings import BROAD, CAPTURE, CONTRAST, CORRELATED, SURE
 from stages.effects.relief_displacement import lean

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Any
 
+from stages.diagnose.judge.claim import Refusal
 from stages.effects import Effect, get_effect
 
 
@@ -79,7 +80,8 @@ class Answer:
     verdict: str
     causes: list[Named] = field(default_factory=list)
     budget: dict[str, float] = field(default_factory=dict)
-    rejected: dict[str, tuple[float, str]] = field(default_factory=dict)
+    ordinary: list[Named] = field(default_factory=list)  # sure, and of a size that any data set has
+    rejected: dict[str, Refusal] = field(default_factory=dict)
     registration: dict[str, tuple[float, float, float]] = field(default_factory=dict)
     unexplained_fraction: float = 0.0
     structure: dict[str, float] = field(
@@ -91,7 +93,7 @@ class Answer:
     sites: int = 0
     images: int = 0
     note: str = ""
-    form: str = ""  # of the nominal model, where that asked for was replaced
+    law: float = math.nan  # departures of the law that are fitted, in standard deviations of measured laws
     config: dict[str, Any] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
@@ -100,7 +102,11 @@ class Answer:
             "verdict": self.verdict,
             "causes": [c.to_json() for c in self.causes],
             "budget": {k: number(v) for k, v in self.budget.items()},
-            "rejected": [{"effect": k, "gain_nats": number(g), "why": why} for k, (g, why) in self.rejected.items()],
+            "ordinary": [c.to_json() for c in self.ordinary],
+            "rejected": [
+                {"effect": k, "gain_nats": number(r.gain), "reason": r.reason.name.lower(), "why": str(r)}
+                for k, r in self.rejected.items()
+            ],
             "registration": [
                 {"form": k, "held_out_gain_percent": number(g), "low": number(a), "high": number(b)}
                 for k, (g, a, b) in self.registration.items()
@@ -111,22 +117,13 @@ class Answer:
             "held_out": self.held_out.to_json(),
             "data": {"pairs": self.pairs, "sites": self.sites, "images": self.images},
             "note": self.note,
-            "nominal": self.form or None,
+            "law_departure": number(self.law),
             "sentence": self.sentence(),
             "config": self.config,
         }
 
     def sentence(self) -> str:
         """The diagnosis in plain words."""
-        if not self.form:
-            return self._finding()
-        asked = self.config.get("model", "the model")
-        return (
-            f"The ground's reflectance does not follow {asked}: {self.form} were fitted in its place, and take up whatever changes the law "
-            f"(phase slope, opposition, limb, roughness); if the law is known, give it as the model. {self._finding()}"
-        )
-
-    def _finding(self) -> str:
         if self.note:
             return self.note[0].upper() + self.note[1:] + ("" if self.note.endswith(".") else ".")
         if self.verdict == "named":

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from stages.common import page
 from stages.common.page.pictures import chart_svg, coloured, new_chart, photo_uri
+from stages.diagnose.data.sites import Site
+from stages.diagnose.judge.state import State
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.nominal import lit_mask
-from stages.diagnose.model.sites import Site
-from stages.diagnose.search.state import State
 
 CROPS = 3
 CURVE_SITES = 8
@@ -45,7 +45,7 @@ def draw(state: State, image_ids: Sequence[str]) -> dict[str, list[Markup]]:
 
 def _models(state: State, site: Site) -> tuple[Chain, Chain]:
     """Under the nominal model as it is fitted alone, and under everything that was named."""
-    return state.plain().chain(site, []), state.nominal.chain(site, state.base)
+    return state.beside([]).chain(site, []), state.nominal.chain(site, state.base)
 
 
 def _crops(state: State, image_ids: Sequence[str]) -> list[Crop]:

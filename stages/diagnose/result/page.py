@@ -11,9 +11,9 @@ from markupsafe import Markup
 from schemas import atomic_path
 from stages.common import page
 from stages.common.page.diagnosis import About, chapters, conclusions, numbers
+from stages.diagnose.judge.state import State
 from stages.diagnose.result.answer import Answer
 from stages.diagnose.result.drawings import draw
-from stages.diagnose.search.state import State
 from stages.effects import get_effect
 
 
@@ -24,7 +24,7 @@ def write_page(path: Path, answer: Answer, state: State | None, image_ids: Seque
     sections = [page.Section(title, parts) for title, parts in chapters(said, _about, drawn)]
     large = numbers(said)
     head = [*([page.headline(large)] if large else []), page.conclusions(conclusions(said))]
-    nominal = answer.form or answer.config.get("checkpoint") or answer.config.get("model", "")
+    nominal = answer.config.get("checkpoint") or answer.config.get("model", "")
     subtitle = f"made by lunargr {version('lunargr')} from {answer.pairs} pairs in {answer.images} images; nominal model: {nominal}"
     text = page.page(
         "What the simulation gets wrong",

@@ -1,0 +1,1 @@
+"""What is known of the data: sites, and images laid over them."""

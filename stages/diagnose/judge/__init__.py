@@ -1,0 +1,1 @@
+"""Claims, and the one function that decides on them."""

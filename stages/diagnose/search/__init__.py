@@ -1,1 +1,0 @@
-"""Step 4: name one effect after the other, rendering again with every one that was named."""
