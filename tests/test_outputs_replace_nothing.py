@@ -182,13 +182,13 @@ def test_the_geotiff_of_a_merged_map_does_not_replace_a_part(monkeypatch, capsys
 
 def test_the_parts_behind_a_virtual_artefact_are_inputs(monkeypatch, capsys, inputs, tmp_path):
     """A view reads from its parts: to write over one would change the view without a word."""
-    from stages import merge, sample
+    from stages import merge, project, sample
 
+    sample.run(inputs / "scene.h5", tmp_path / "crops.h5", sample.Config(count=20, tile_m=1280, seed=3))
     for k in range(2):
-        config = sample.Config(count=20, tile_m=1280, seed=3, shard=(k, 2))
-        sample.run(inputs / "scene.h5", tmp_path / f"part{k}.h5", config)
+        project.run(tmp_path / "crops.h5", tmp_path / f"part{k}.h5", project.Config(shard=(k, 2)))
     merge.run([tmp_path / "part0.h5", tmp_path / "part1.h5"], tmp_path / "whole.h5", merge.Config(virtual=True))
-    refused(monkeypatch, capsys, tmp_path, ["project", "whole.h5", "-o", "part1.h5", "--overwrite"], "part1.h5")
+    refused(monkeypatch, capsys, tmp_path, ["train", "whole.h5", "-o", "part1.h5", "--overwrite"], "part1.h5")
 
 
 def test_an_output_that_nobody_declared_cannot_replace_anything(tmp_path):
