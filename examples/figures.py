@@ -201,7 +201,13 @@ def diagnosed(root: Path, folder: str, command: str) -> list[str]:
     lines += table(["cause", "value"], rows) if rows else []
     if rows and judged.get("gain_percent") is not None:
         gain = percent(judged["gain_percent"], judged["gain_percent_low"], judged["gain_percent_high"])
-        lines.append(f"- With these causes the squared error on {judged['pairs']} unseen pairs is lower by {gain}.")
+        pairs = f"{judged['pairs']} unseen pairs"
+        sure = (judged["gain_percent_low"] or 0.0) > 0
+        lines.append(
+            f"- With these causes the squared error on {pairs} is lower by {gain}."
+            if sure
+            else f"- With these causes the squared error on {pairs} shows no sure difference: gain {gain}."
+        )
     return lines
 
 
