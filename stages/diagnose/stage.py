@@ -191,6 +191,8 @@ def register(state: State) -> None:
 def judge(answer: Answer, state: State, outcome: Outcome, cut: Cut | None, before: float) -> None:
     """Decide on the claims of all sources and write everything into the answer; before : mean square of the residual when nothing was known"""
     after, view = mean_square(state), outcome.view
+    if state.causes:  # where the images lie now, beside no cause
+        before = max(before, mean_square(dataclasses.replace(state, causes=[], nominal=state.beside([]))))
     words = in_words(state)
     claims = [by_clipping(state, cut)] if cut else []
     claims += [*by_registration(state), *by_ground(state), *by_images(state)]
