@@ -10,7 +10,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import cv2
 import h5py
 import matplotlib
 import numpy as np
@@ -217,16 +216,6 @@ def renderings(evaluation: h5py.File, k: int) -> dict[str, np.ndarray]:
 def save(figure, output: Path) -> None:
     figure.savefig(output, dpi=110, facecolor="white", pil_kwargs={"quality": QUALITY})
     plt.close(figure)
-
-
-def shrink(source: Path, output: Path, width: int) -> None:
-    """A PNG as JPEG of at most ``width`` px."""
-    picture = cv2.imread(str(source), cv2.IMREAD_COLOR)
-    scale = min(1.0, width / picture.shape[1])
-    size = (round(picture.shape[1] * scale), round(picture.shape[0] * scale))
-    cv2.imwrite(
-        str(output), cv2.resize(picture, size, interpolation=cv2.INTER_AREA), [cv2.IMWRITE_JPEG_QUALITY, QUALITY]
-    )
 
 
 def main(root: Path) -> None:

@@ -33,7 +33,6 @@ BROAD = 6.0  # px, sigma: broader structure (albedo, film) is taken out before i
 # of the rendered contrast that an image shows where it matches: in files of three simulators from 0.3 where it lay there, up to 0.16 where it did not
 CONTRAST = 0.25
 FIELD_ORDER = 3  # degree of the polynomial over the scene that stands for a smooth field per frame
-MIMICKED = 0.1  # of the error of a shift: where causes looked like a quarter, registration had a tenth of them
 
 # --- covariance ---
 SECTORS = 6  # directions of waves that are told apart: relief shows by its direction to the Sun
@@ -47,20 +46,13 @@ FAULTY = 0.002  # of the squares: less is no matter of a camera, however sure
 FAULTS = 0.002  # chance that any partition of a detector seems to differ where none does
 DISCOVERY = 0.05  # false discovery rate
 FAINT = 0.02  # of what images leave, rms: the covariance and the law are not known better, and many pixels would make that sure
-ROUGHLY = (
-    0.05  # of the same: beside an effect of the law with a name, whose formula is one of several for the same thing
-)
 SURE = 4.0  # standard errors: an effect found at this size is never called invisible
-LIKELIER = math.log(100)  # nats of one value for all images over one for each: as sure as 2.6 standard errors
 STILL = 2.6  # standard errors (99 %) of a name that was found at four, once all is registered and fitted again
 CORRELATED = 16.0  # px^2 per independent sample of a residual: what is left of albedo and relief is some 4 px wide
 PEAK = 6.0  # times the median of its annulus: a single wave of one frame that the spectrum of ground and noise does not have
 NEAR = 1.5  # waves: the leakage of a window ends before ...
 FAR = 4  # ... and about a line there is none within so many
-HALVED = 0.5  # of the squared residual: laws that leave less take the place of the nominal one
 MISFIT = 0.5  # rms residual over rms signal, beyond which the nominal model says nothing about the images
-BROADEST = 3  # annuli: up to four waves across a piece of ground, what stray light and film differ by within one
-ALIKE = 0.03  # of the squares of these, surely (95 %): laws and flat fields that are not known to a few tenths of a per cent make up to 0.02 alike
 FLAT = 0.0025  # rms of lines across the detector's columns, relative to brightness, that a good flat field leaves
 STANDS_OUT = (
     20.0,
