@@ -118,7 +118,6 @@ def test_presets_are_whole_and_say_where_they_come_from():
         ({"full_well": 1e4, "bits": 12.5}, InputError, "'bits': expected a whole number"),
         ({"full_well": 1e4, "exposure_s": 0.1}, ConfigError, "'exposure_s': expected with f_number, pixel_um"),
         ({"full_well": 1e4, "dark_signal": 5}, ConfigError, "'dark_signal': expected with f_number"),
-        ({"full_well": 1e4, "exposure_s": 0.1, "auto_level": 0.5}, ConfigError, "found both"),
         ({"full_well": 1e4, "offset_dn": 5000}, ConfigError, "'offset_dn': expected less than 4095"),
         ([1], InputError, "expected a JSON object"),
     ],

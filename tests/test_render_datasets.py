@@ -110,6 +110,38 @@ def test_colmap_reads_the_cameras_and_every_point_lies_where_it_is_seen(hilly_ma
         assert cv2.imread(str(target / "images" / image.name)).shape == (40, 60, 3)
 
 
+@pytest.mark.parametrize("distortion", [{"k1": -0.2, "k2": 0.05, "p1": 1e-3}, {"model": "fisheye", "k1": 0.1}])
+def test_colmap_reads_a_distorted_camera(hilly_map, tmp_path, monkeypatch, capsys, distortion):
+    pycolmap = pytest.importorskip("pycolmap")
+    camera = {
+        "type": "pinhole", "focal_px": 200.0, "principal_point_px": [30, 20], "size_px": [60, 40],
+        "position_mcmf": [RADIUS + 5, 0, 0], "rotation_camera_to_mcmf": [0, 0, 0, 1], "distortion": distortion,
+    }  # fmt: skip
+    (tmp_path / "camera.json").write_text(json.dumps(camera))
+    (tmp_path / "t.csv").write_text(TRAJECTORY)
+    arguments = (
+        "--trajectory",
+        tmp_path / "t.csv",
+        *SUN,
+        "--camera",
+        tmp_path / "camera.json",
+        "--export",
+        "colmap,nerfstudio",
+    )
+    code, error = lunargr_render(monkeypatch, capsys, hilly_map[0], *arguments, "-o", tmp_path / "views", "--quiet")
+    assert code == 0, error
+    model = pycolmap.Reconstruction(str(tmp_path / "views" / "colmap" / "sparse" / "0"))
+    errors = [
+        model.images[e.image_id].project_point(point.xyz) - model.images[e.image_id].points2D[e.point2D_idx].xy
+        for point in model.points3D.values()
+        for e in point.track.elements
+    ]
+    assert len(model.cameras) == 1 and len(errors) > 500 and np.abs(errors).max() < 0.01
+    document = json.loads((tmp_path / "views" / "nerfstudio" / "transforms.json").read_text())
+    assert document["frames"][0]["k1"] == distortion["k1"]
+    assert document["camera_model"] == ("OPENCV_FISHEYE" if "model" in distortion else "OPENCV")
+
+
 def test_colmaps_points_lie_on_the_map(hilly_map, tmp_path, monkeypatch, capsys):
     import h5py
 

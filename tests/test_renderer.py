@@ -34,10 +34,10 @@ def test_a_frame_is_what_the_command_writes_however_often_it_is_asked_for(hilly_
 
 
 def test_horizons_and_pyramids_are_made_once(hilly_map, monkeypatch):
-    from stages.render import perspective, setup
+    from stages.render import grounds, setup
 
     made = []
-    for module, name in ((setup, "SunHorizon"), (perspective, "build_height_field")):
+    for module, name in ((setup, "SunHorizon"), (grounds, "build_height_field")):
         original = getattr(module, name)
         monkeypatch.setattr(module, name, lambda *a, f=original, n=name: (made.append(n), f(*a))[1])
     with render.Renderer(hilly_map[0], samples=1) as renderer:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
-
-import typer
+from typing import Any
 
 from lunargr_cli.console import Console
 from lunargr_cli.options import (
@@ -17,12 +15,50 @@ from lunargr_cli.options import (
     Resume,
     Seed,
     Shard,
-    complete_model,
     configure,
     make_output,
     parse_shard,
     read_list,
     read_parameters,
+)
+from lunargr_cli.view_options import (
+    CONVERGENCE,
+    Altitude,
+    BackplanesInTif,
+    Bounce,
+    Camera,
+    Convergence,
+    Dem,
+    EarthAzimuth,
+    EarthElevation,
+    Earthshine,
+    Export,
+    Extend,
+    Fov,
+    LookAt,
+    Model,
+    Parameters,
+    PngOnly,
+    Position,
+    Quaternion,
+    RenderOutput,
+    Roll,
+    Samples,
+    Sensor,
+    Shadows,
+    Size,
+    SolarDistance,
+    Source,
+    Spin,
+    Stereo,
+    SubsolarLatitude,
+    SubsolarLongitude,
+    SunAzimuth,
+    SunElevation,
+    Time,
+    Trajectory,
+    Velocity,
+    View,
 )
 from schemas.errors import ConfigError
 from stages import render
@@ -32,185 +68,6 @@ from stages.render import Config, StereoConfig, Summary
 NAME, ORDER = "render", 60
 SMOOTH = 2.0  # image pixels to a DEM pixel, from which on a view looks smooth
 Options = Mapping[str, Any]  # of a call, by name
-CONVERGENCE = ",".join(f"{edge:g}" for edge in StereoConfig.convergence_deg)
-
-
-# What is rendered
-Source = Annotated[Path | None, typer.Argument(metavar="[SVBRDF.h5]", help="Reflectance map from 'lunargr infer'.")]
-RenderOutput = Annotated[
-    Path,
-    typer.Option(
-        "--output",
-        "-o",
-        help="NAME.exr writes EXR, PNG and, for ortho views, GeoTIFF; NAME.tif or NAME.png leaves out the EXR. A folder with --trajectory.",
-    ),
-]
-Dem = Annotated[
-    Path | None,
-    typer.Option(
-        "--dem",
-        metavar="DEM",
-        help="Render this DEM (any GDAL format, or scene.h5) with one reflectance everywhere.",
-    ),
-]
-Model = Annotated[
-    str | None,
-    typer.Option(
-        "--model",
-        autocompletion=complete_model,
-        help="Reflectance model for --dem; 'lunargr models' lists them.",
-    ),
-]
-Parameters = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--parameters",
-        metavar="NAME=VALUE,...",
-        help="Model parameters for --dem, such as w=0.3,theta_deg=20; the others take their defaults.",
-    ),
-]
-Extend = Annotated[
-    Path | None,
-    typer.Option("--extend", metavar="FILE", help="diagnosis.h5: add the effects that it names."),
-]
-# The Sun, and other light
-SunAzimuth = Annotated[
-    float | None,
-    typer.Option("--sun-azimuth", metavar="DEG", help="Azimuth of the Sun at the map centre, clockwise from north."),
-]
-SunElevation = Annotated[
-    float | None, typer.Option("--sun-elevation", metavar="DEG", help="Elevation of the Sun at the map centre.")
-]
-SubsolarLongitude = Annotated[
-    float | None,
-    typer.Option(
-        "--subsolar-longitude",
-        metavar="DEG",
-        help="East longitude of the sub-solar point, instead of azimuth and elevation.",
-    ),
-]
-SubsolarLatitude = Annotated[
-    float | None, typer.Option("--subsolar-latitude", metavar="DEG", help="Latitude of the sub-solar point.")
-]
-SolarDistance = Annotated[
-    float | None,
-    typer.Option("--solar-distance", metavar="AU", help="Distance of the Sun; sets the penumbra (default: 1)."),
-]
-Time = Annotated[
-    str | None,
-    typer.Option("--time", metavar="UTC", help="Time, instead of a direction of the Sun, such as 2010-11-09T13:06:40."),
-]
-Shadows = Annotated[bool, typer.Option("--shadows/--no-shadows", help="Cast shadows with the Sun's disc.")]
-Bounce = Annotated[
-    bool, typer.Option("--bounce", help="Add light that sunlit terrain scatters onto other terrain, once.")
-]
-Earthshine = Annotated[
-    bool,
-    typer.Option(
-        "--earthshine", help="Add light from the Earth, at --time or from --earth-azimuth and --earth-elevation."
-    ),
-]
-EarthAzimuth = Annotated[
-    float | None,
-    typer.Option(
-        "--earth-azimuth", metavar="DEG", help="Azimuth of the Earth at the map centre, clockwise from north."
-    ),
-]
-EarthElevation = Annotated[
-    float | None, typer.Option("--earth-elevation", metavar="DEG", help="Elevation of the Earth at the map centre.")
-]
-# A camera
-View = Annotated[
-    str | None,
-    typer.Option(
-        "--view",
-        metavar="ortho|pinhole",
-        help="ortho: the map's own grid (default); pinhole: a camera, as options of a camera imply.",
-    ),
-]
-Position = Annotated[
-    str | None,
-    typer.Option(
-        metavar="LON,LAT,ALT",
-        help="Camera position: degrees, and metres above the reference sphere. In ortho views: the point from which the ground is seen.",
-    ),
-]
-LookAt = Annotated[
-    str | None,
-    typer.Option(
-        "--look-at", metavar="LON,LAT[,ALT]", help="Ground point at the image centre (default: straight down)."
-    ),
-]
-Quaternion = Annotated[
-    str | None,
-    typer.Option(
-        metavar="W,X,Y,Z",
-        help="Rotation from camera axes (right, down, forward) to body-fixed, instead of --look-at.",
-    ),
-]
-Roll = Annotated[
-    float | None, typer.Option("--roll", metavar="DEG", help="Turn the camera clockwise about its line of sight.")
-]
-Fov = Annotated[
-    float | None,
-    typer.Option("--fov", metavar="DEG", help=f"Field of view across the image's width (default: {Config.fov_deg:g})."),
-]
-Size = Annotated[
-    str | None,
-    typer.Option(
-        "--size", metavar="W,H", help=f"Image size in pixels (default: {','.join(map(str, Config.size_px))})."
-    ),
-]
-Camera = Annotated[
-    Path | None,
-    typer.Option(metavar="FILE", help="Camera model (pinhole JSON, ALE/CSM ISD, ...) in place of the options above."),
-]
-Sensor = Annotated[
-    str | None,
-    typer.Option(
-        metavar="FILE|NAME",
-        help="Camera views: also write DN as NAME_dn.tif (linear, 16 bits), by a sensor JSON or a preset (mardi, mer_navcam).",
-    ),
-]
-Samples = Annotated[
-    int | None,
-    typer.Option(metavar="N", help="N x N rays per pixel (default: one per DEM pixel and axis, 2 to 8)."),
-]
-# A map
-BackplanesInTif = Annotated[
-    bool, typer.Option("--backplanes", help="Ortho views: also write the backplanes into the GeoTIFF.")
-]
-# A trajectory
-Trajectory = Annotated[
-    Path | None,
-    typer.Option(metavar="CSV", help="Table with one view per row (docs/render.md); --output then names a folder."),
-]
-Export = Annotated[
-    str | None,
-    typer.Option(
-        "--export",
-        metavar="colmap,nerfstudio",
-        help="With --trajectory: also write the views as a COLMAP or Nerfstudio data set, or both.",
-    ),
-]
-PngOnly = Annotated[bool, typer.Option("--png-only", help="With --trajectory: write no EXR files.")]
-# Stereo pairs
-Stereo = Annotated[
-    int | None,
-    typer.Option(
-        "--stereo",
-        metavar="N",
-        max=100_000,  # names have five digits
-        help="Write N stereo pairs with dense correspondences into the folder --output.",
-    ),
-]
-Altitude = Annotated[
-    float | None, typer.Option(metavar="M", help="With --stereo: height of both cameras above the ground.")
-]
-Convergence = Annotated[
-    str,
-    typer.Option(metavar="LOW,HIGH", help="With --stereo: range of the angle between both lines of sight, deg."),
-]
 
 
 def command(
@@ -234,6 +91,8 @@ def command(
     size_px: Size = None,
     camera: Camera = None,
     sensor: Sensor = None,
+    velocity: Velocity = None,
+    spin_deg: Spin = None,
     samples: Samples = None,
     trajectory: Trajectory = None,
     export: Export = None,
@@ -294,7 +153,7 @@ def _mode(given: Options) -> str:
     """'view', 'trajectory' or 'stereo'; refuses options of the others. Raises ConfigError."""
     mode = "stereo" if given["stereo"] is not None else "trajectory" if given["trajectory"] else "view"
     if mode == "stereo":
-        own = ("trajectory", "camera", "position", "look_at", "quaternion", "roll_deg", "shard")
+        own = ("trajectory", "camera", "position", "look_at", "quaternion", "roll_deg", "velocity", "spin_deg", "shard")
         if given["resume"] or any(given[name] is not None for name in own):
             raise ConfigError(
                 "--stereo: expected without a camera's place and attitude, --trajectory, --shard and --resume; it draws its own."
@@ -316,7 +175,7 @@ def _converted(given: Options) -> dict[str, Any]:
     modes = [option for option in ("camera", "trajectory") if given[option]]
     if given["view"] == "ortho" and modes:
         raise ConfigError(f"--{modes[0]}: expected without --view ortho; leave one of them out.")
-    attitude = ("look_at", "quaternion", "roll_deg", "fov_deg", "size_px", "sensor", "stereo")
+    attitude = ("look_at", "quaternion", "roll_deg", "fov_deg", "size_px", "velocity", "spin_deg", "sensor", "stereo")
     seen_by_camera = modes or any(given[name] is not None for name in attitude)
     implied = "pinhole" if seen_by_camera else Config.view
     return {
@@ -326,6 +185,8 @@ def _converted(given: Options) -> dict[str, Any]:
         "position": read_list("--position", given["position"], (3,)),
         "look_at": read_list("--look-at", given["look_at"], (2, 3)),
         "quaternion": read_list("--quaternion", given["quaternion"], (4,)),
+        "velocity": read_list("--velocity", given["velocity"], (3,)),
+        "spin_deg": read_list("--spin", given["spin_deg"], (3,)),
         "size_px": Config.size_px if given["size_px"] is None else _size(given["size_px"]),
         "export": tuple(given["export"].split(",")) if given["export"] else (),
         "camera": str(given["camera"]) if given["camera"] else None,

@@ -7,9 +7,10 @@ from typing import Annotated
 
 import typer
 
-from lunargr_cli.commands.render import Dem, Model, Parameters, Samples, Sensor, Shadows, Source, find_source
+from lunargr_cli.commands.render import find_source
 from lunargr_cli.console import flush_out, write_out
 from lunargr_cli.options import BodyOption, configure, read_parameters
+from lunargr_cli.view_options import Dem, Model, Parameters, Samples, Sensor, Shadows, Source
 from stages.render import Config
 
 NAME, ORDER = "serve", 62

@@ -47,7 +47,7 @@ def fit_chart(grid: Grid) -> Chart:
     margin = 0.1 * max(height, width) + 4
     lon, lat = grid.lonlat((height - 1) / 2, (width - 1) / 2)
     up = unit_vectors(float(lon), float(lat))
-    axes = _axes_about(up)
+    axes = axes_about(up)
     row, col, x, y = _lattice(grid, axes, margin, 29, 0.0)
     check = _lattice(grid, axes, margin, 28, 0.37)
     scale = float(max(np.abs(x).max(), np.abs(y).max()))
@@ -68,7 +68,7 @@ def fit_chart(grid: Grid) -> Chart:
     )
 
 
-def _axes_about(up: Floats) -> Floats:
+def axes_about(up: Floats) -> Floats:
     """East, north, up about a place; any east will do at a pole."""
     east = np.cross([0.0, 0.0, 1.0], up)
     if np.linalg.norm(east) < 1e-9:

@@ -21,6 +21,7 @@ SUN = (
     "solar_distance_au",
     "time",
 )
+RATES = ("velocity", "spin_deg")  # of a camera that moves
 CAMERA = (
     "position",
     "look_at",
@@ -28,14 +29,16 @@ CAMERA = (
     "roll_deg",
     "fov_deg",
     "size_px",
+    *RATES,
 )  # of a view, in place of a camera model
 
 # What each kind of view does not look at: set all the same, it would be ignored.
 _ATTITUDE = ("look_at", "quaternion", "roll_deg", "fov_deg", "size_px")
 IGNORED = {
-    "`view` ortho": (*_ATTITUDE, "samples", "sensor", "png_only"),
+    "`view` ortho": (*_ATTITUDE, *RATES, "samples", "sensor", "png_only"),
     "`camera`": (*_ATTITUDE, "position", "backplanes_in_tif", "png_only"),
-    "a trajectory": ("position", "quaternion", "roll_deg", "backplanes_in_tif"),
+    "a trajectory": ("position", "quaternion", "roll_deg", *RATES, "backplanes_in_tif"),
+    "`camera` in a trajectory": ("fov_deg", "size_px"),
     "`view` pinhole": ("backplanes_in_tif", "png_only"),
     "`quaternion`": ("look_at", "roll_deg"),
 }
@@ -50,7 +53,8 @@ class Config:
     position : longitude, latitude, metres above the sphere; in an ortho view the place that light is reflected to
     look_at : longitude, latitude (and metres above the sphere; the ground's own height where that is absent)
     quaternion : w, x, y, z, camera axes (right, down, forward) to body-fixed, instead of look_at
-    camera : path of a camera model (JSON), instead of position, attitude, fov and size
+    camera : path of a camera model (JSON), instead of position, attitude, fov and size; of a trajectory instead of fov and size
+    velocity : m/s towards east, north and up; spin_deg : deg/s about the camera's axes: for a sensor's exposure and lines
     sensor : a preset's name or a JSON file: DN beside the I/F, with noise drawn from ``seed`` and the view's name
     samples : rays per pixel and axis (None: as many as the pixel's footprint asks for)
     model, parameters : a reflectance that is the same everywhere, where the source holds none
@@ -73,6 +77,8 @@ class Config:
     roll_deg: float = 0.0
     fov_deg: float = 20.0
     size_px: tuple[int, int] = (1024, 1024)
+    velocity: tuple[float, ...] | None = None
+    spin_deg: tuple[float, ...] | None = None
     camera: str | None = None
     sensor: str | None = None
     seed: int = 0
@@ -165,6 +171,12 @@ def check(config: Config, trajectory: bool = False, drawn_sun: bool = False) -> 
             raise ConfigError(f"`export`: expected any of {', '.join(EXPORTS)}, each once; found '{kind}'.")
     kind = "a trajectory" if trajectory else "`camera`" if config.camera else f"`view` {config.view}"
     refuse_ignored(config, kind)
+    for name in RATES:
+        rate = getattr(config, name)
+        if rate is not None and config.sensor is None:
+            raise ConfigError(f"`{name}`: expected with a `sensor`, whose exposure or lines it smears; found none.")
+        if rate is not None and len(rate) != 3:
+            raise ConfigError(f"`{name}`: expected three numbers, found {len(rate)}.")
     if kind != "`view` pinhole":
         return
     if config.position is None:
@@ -175,9 +187,9 @@ def check(config: Config, trajectory: bool = False, drawn_sun: bool = False) -> 
 
 def check_trajectory(config: Config) -> None:
     """Refuse options that cannot go together in a trajectory. Raises ConfigError."""
-    if config.camera:
-        raise ConfigError("`trajectory`: expected no `camera`; each row places its own pinhole camera.")
     check(replace(config, view="pinhole"), trajectory=True)
+    if config.camera:
+        refuse_ignored(config, "`camera` in a trajectory")
     if config.export and config.shard[1] > 1:
         raise ConfigError(
             "`export`: expected without `shard`; render the shards, then export with `resume` and no `shard`."

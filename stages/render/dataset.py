@@ -17,19 +17,22 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.errors import InputError
+from schemas.errors import ConfigError, InputError
 from schemas.files.companions import companions_of
 from schemas.files.locks import claim
 from schemas.files.outputs import atomic_path
 from stages.common.arrays import Floats, Floats32, Mask
 from stages.physics.cameras import Camera
+from stages.physics.cameras.distortion import FISHEYE, NONE, RADTAN, distort_arrays, undistort_arrays
 from stages.physics.cameras.pinhole import Pinhole
 from stages.physics.maps.grid import Grid
+from stages.render.motion import Moving
 from stages.render.pictures import read_exr, stretch
 
 EXPORT_PASSES = 3  # over all views: for a common white, for the pictures, for the data set's own tables
 POINTS_PER_SIDE = 24  # of each view, on which the sparse points are picked
 SAME_PLACE = 2e-3  # of the distance: a point that another view sees this near is the same
+COLMAP_MODELS = {NONE: ("PINHOLE", 0), RADTAN: ("FULL_OPENCV", 8), FISHEYE: ("OPENCV_FISHEYE", 4)}  # and coefficients
 GL_AXES = np.diag([1.0, -1.0, -1.0])  # nerfstudio's cameras look along -z, with y up
 
 
@@ -108,7 +111,7 @@ def _ray_slopes(camera: Pinhole) -> tuple[Floats, Floats]:
     sample, line = np.meshgrid(np.arange(camera.samples) + 0.5, np.arange(camera.lines) + 0.5)
     x = (sample - camera.principal_point_px[0]) / camera.focal_px[0]
     y = (line - camera.principal_point_px[1]) / camera.focal_px[1]
-    return x, y
+    return undistort_arrays(*camera.distortion, x, y)
 
 
 def _white(views: Iterable[View]) -> float:
@@ -163,13 +166,30 @@ def write_cameras(
             "quaternion_camera_to_enu_wxyz": to_quaternion(rotation),
             "sun_direction_enu": (world.axes @ away / np.linalg.norm(away)).tolist(),
         }
-        views.append({"view_id": name, **camera.to_document(), "sun_position_mcmf": sun.tolist(), **local})
+        views.append(
+            {
+                "view_id": name,
+                **camera.to_document(),
+                **motion_facts(camera),
+                "sun_position_mcmf": sun.tolist(),
+                **local,
+            }
+        )
     write_text(path, json.dumps({**_world_document(world, grid), "views": views}, indent=1))
 
 
 def camera_facts(camera: Camera) -> dict[str, str]:
-    """Attributes of an EXR: a pinhole's document; a camera file is named by the settings."""
-    return {"camera": json.dumps(camera.to_document())} if isinstance(camera, Pinhole) else {}
+    """Attributes of an EXR: a pinhole's document and motion; a camera file is named by the settings."""
+    facts = {"camera": camera.to_document()} if isinstance(camera, Pinhole) else {}
+    return {name: json.dumps(fact) for name, fact in (facts | motion_facts(camera)).items()}
+
+
+def motion_facts(camera: Camera) -> dict[str, Any]:
+    """What moves during the picture: m/s and rad/s, body-fixed, s; nothing of a camera that stands still."""
+    if not isinstance(camera, Moving):
+        return {}
+    numbers = {"velocity_mcmf": camera.velocity.tolist(), "spin_mcmf": camera.spin.tolist()}
+    return {"motion": numbers | {"exposure": camera.exposure, "line_time": camera.line_time}}
 
 
 def _write_nerfstudio(views: Sequence[View], world: World, target: Path, report: Callable[[int], None]) -> None:
@@ -192,12 +212,22 @@ def _write_nerfstudio(views: Sequence[View], world: World, target: Path, report:
                 **_intrinsics(view.camera),
             }
         )
-    document = {"camera_model": "OPENCV", "orientation_override": "none", "frames": frames}
+    fisheye = any(view.camera.distortion[0] == FISHEYE for view in views)
+    document = {
+        "camera_model": "OPENCV_FISHEYE" if fisheye else "OPENCV",
+        "orientation_override": "none",
+        "frames": frames,
+    }
     write_text(target / "transforms.json", json.dumps(document, indent=1))
 
 
 def _intrinsics(camera: Pinhole) -> dict[str, float]:
-    return {
+    """Raises ConfigError for distortion that nerfstudio has no words for."""
+    given = camera.to_document().get("distortion", {})
+    factors = {name: value for name, value in given.items() if name != "model" and value != 0}
+    if camera.distortion[0] == RADTAN and {"k4", "k5", "k6"} & set(factors):
+        raise ConfigError("`export`: expected distortion up to k3 for nerfstudio, found k4 to k6; export colmap alone.")
+    return factors | {
         "fl_x": camera.focal_px[0],
         "fl_y": camera.focal_px[1],
         "cx": camera.principal_point_px[0],
@@ -224,8 +254,10 @@ def _write_colmap(views: Sequence[View], world: World, target: Path, report: Cal
     numbers: dict[str, int] = {}  # intrinsics -> camera: views that share a camera name it together
     for k, view in enumerate(views):
         c = view.camera
-        intrinsics = (*c.focal_px, *c.principal_point_px)
-        told = f"PINHOLE {c.samples} {c.lines} {' '.join(f'{v:.9g}' for v in intrinsics)}"
+        code, coefficients = c.distortion
+        model, count = COLMAP_MODELS[code]
+        intrinsics = (*c.focal_px, *c.principal_point_px, *coefficients[:count])
+        told = f"{model} {c.samples} {c.lines} {' '.join(f'{v:.9g}' for v in intrinsics)}"
         if told not in numbers:
             numbers[told] = len(numbers) + 1
             cameras.append(f"{numbers[told]} {told}")
@@ -276,8 +308,9 @@ def project(camera: Pinhole, world: World, points: Floats) -> tuple[Mask, Floats
     local = (points - place) @ rotation
     ahead = local[:, 2] > 0
     z = np.where(ahead, local[:, 2], 1.0)
-    x = camera.focal_px[0] * local[:, 0] / z + camera.principal_point_px[0]
-    y = camera.focal_px[1] * local[:, 1] / z + camera.principal_point_px[1]
+    x, y = distort_arrays(*camera.distortion, local[:, 0] / z, local[:, 1] / z)
+    x = camera.focal_px[0] * x + camera.principal_point_px[0]
+    y = camera.focal_px[1] * y + camera.principal_point_px[1]
     inside = ahead & (x >= 0) & (y >= 0) & (x < camera.samples) & (y < camera.lines)
     return inside, x, y, np.linalg.norm(local, axis=1)
 

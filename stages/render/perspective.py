@@ -2,30 +2,23 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from collections import OrderedDict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from weakref import WeakKeyDictionary
 
 import numba
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from rasterio.transform import Affine
 
-from schemas.errors import GeometryError
 from stages.common.arrays import Floats, Floats32
 from stages.physics.cameras.base import Camera
 from stages.physics.cameras.distortion import NONE
 from stages.physics.cameras.pinhole import Pinhole
-from stages.physics.formation.chain import Observation, State
 from stages.physics.formation.geometry import Angles
-from stages.physics.maps.grid import CSM_CENTRE, Grid
+from stages.physics.maps.grid import CSM_CENTRE
 from stages.physics.maps.window import Window
 from stages.physics.photometry import masked_radiance_factor
-from stages.physics.terrain.further_light import Horizon
 from stages.physics.terrain.shading import (
     BACKPLANES,
     HALO_PX,
@@ -36,73 +29,15 @@ from stages.physics.terrain.shading import (
 )
 from stages.physics.terrain.sun_visibility import visible_share
 from stages.physics.terrain.surface import Surface
+from stages.render.grounds import Ground, Grounds
+from stages.render.motion import Moving, moments
 from stages.render.ray_points import HitAngles, hit_angles, sample_maps
-from stages.render.raycast import HIT, MISS, HeightField, Hits, build_height_field, cast
+from stages.render.raycast import HIT, MISS, Hits, cast
+from stages.render.sight import seen_window
 from stages.render.viewpoint import pixel_footprint
 
-MOST_SAMPLES = 8  # rays per pixel and axis; beyond, the terrain itself is averaged first
 RAYS_AT_ONCE = 1 << 17  # arrays of them stay in a processor's cache
 BLOCK_PX = 512  # of further light at once
-LATTICE = 33  # rays per axis of the first look
-LARGEST_GROUND = 1 << 25  # pixels of a surface that are kept for later views, for each of MOST_GROUNDS resolutions
-MOST_GROUNDS = 3
-
-
-@dataclass(frozen=True)
-class Ground:
-    """A window of a surface at the resolution that an image's pixels need: all that depends on no Sun and no camera.
-
-    factor : pixels of the surface along one of ``grid``; maps : (C, h, w) coefficients or (C, 1, 1)
-    horizons : towards each Sun, (h, w), rad; kept as long as the Sun's own horizon is
-    """
-
-    window: Window
-    factor: int
-    grid: Grid
-    field: HeightField
-    maps: Floats32
-    horizons: WeakKeyDictionary[Horizon, Floats32] = dataclasses.field(default_factory=WeakKeyDictionary)
-
-    def horizon(self, towards: Horizon | None) -> Floats32 | None:
-        """(h, w), rad; None where nothing casts shadows."""
-        if towards is not None and towards not in self.horizons:
-            self.horizons[towards] = self.coarse(towards.window(*self.window))
-        return None if towards is None else self.horizons[towards]
-
-    def coarse(self, values: Floats32) -> Floats32:
-        """(..., h, w) on ``grid`` from values on the window's own pixels."""
-        return values if self.factor == 1 else coarsen(values, self.factor)
-
-
-class Grounds:
-    """The grounds of a surface that views have seen, one for each resolution, grown to hold all of them up to LARGEST_GROUND pixels."""
-
-    def __init__(self, surface: Surface) -> None:
-        self._surface = surface
-        self._kept: OrderedDict[int, Ground] = OrderedDict()
-
-    def over(self, window: Window, factor: int) -> Ground:
-        """A ground that holds ``window``, at blocks of ``factor`` x ``factor`` pixels. Raises GeometryError."""
-        kept = self._kept.pop(factor, None)
-        if kept is None or kept.window.union(window) != kept.window:
-            whole = window if kept is None else kept.window.union(window)
-            kept = make_ground(self._surface, whole if whole.height * whole.width <= LARGEST_GROUND else window, factor)
-        self._kept[factor] = kept
-        while len(self._kept) > MOST_GROUNDS:
-            self._kept.popitem(last=False)
-        return kept
-
-
-def make_ground(surface: Surface, window: Window, factor: int) -> Ground:
-    """Read a window and prepare it for rays. Raises GeometryError."""
-    elevation, maps = surface.elevation[window.part], surface.read_coefficients(*window)
-    grid = surface.grid.window(*window)
-    if factor > 1:
-        elevation = coarsen(elevation, factor)
-        maps = coarsen(maps, factor) if maps.shape[1] > 1 else maps
-        transform = grid.transform @ Affine.scale(factor)
-        grid = Grid(grid.crs_wkt, transform, elevation.shape[0], elevation.shape[1], grid.radius)
-    return Ground(window, factor, grid, build_height_field(elevation, grid), maps)
 
 
 @dataclass(frozen=True)
@@ -125,109 +60,6 @@ class Scene:
     distance: float
     pixels_per_post: float
     deviation: Floats32 | None = None
-
-
-def seen_window(
-    surface: Surface, camera: Camera, relief: tuple[float, float], samples: int | None
-) -> tuple[Window, int, int, float]:
-    """Which window of the map a camera can see, rays per pixel and axis, coarsening factor, distance to the ground (m).
-
-    samples : rays per pixel and axis, None for as many as the pixel's footprint asks for; relief : lowest and highest elevation, m. Raises GeometryError where the view misses the map or starts under it.
-    """
-    grid = surface.grid
-    line = np.linspace(0, camera.lines, LATTICE)
-    sample = np.linspace(0, camera.samples, LATTICE)
-    lines, columns = (v.ravel() for v in np.meshgrid(line, sample, indexing="ij"))
-    origins, directions = camera.rays(lines, columns)
-    _check_above_ground(surface, origins, relief)
-    near, far = shell_crossing(origins, directions, grid.radius + relief[0] - 1.0, grid.radius + relief[1] + 1.0)
-    steps = np.linspace(0.0, 1.0, 9)
-    distances = near[:, None] + (far - near)[:, None] * steps
-    points = origins[:, None] + distances[..., None] * directions[:, None]
-    known = np.isfinite(distances)
-    if not known.any():
-        raise GeometryError(
-            "the camera does not see the body; check its place, `look_at` (or `quaternion`) and `fov_deg`."
-        )
-    points, distances = points[known], distances[known]
-    lon = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
-    lat = np.degrees(np.arcsin(points[:, 2] / np.linalg.norm(points, axis=1)))
-    row, col = grid.rowcol_of_lonlat(lon, lat)
-    inside = np.isfinite(row) & np.isfinite(col)
-    if not inside.any():
-        raise GeometryError(_misses(surface))
-    row, col, distances = row[inside], col[inside], distances[inside]
-    # beyond the map by more than its own size is no place that a neighbouring ray leads back from
-    row, col = np.clip(row, -grid.height, 2 * grid.height), np.clip(col, -grid.width, 2 * grid.width)
-    pad_row, pad_col = (4 + np.ptp(places) * 1.5 / (LATTICE - 1) for places in (row, col))
-    top, bottom = max(0, int(row.min() - pad_row)), min(grid.height, int(row.max() + pad_row) + 2)
-    left, right = max(0, int(col.min() - pad_col)), min(grid.width, int(col.max() + pad_col) + 2)
-    if bottom - top < 2 or right - left < 2:
-        raise GeometryError(_misses(surface))
-    on_map = (row > -0.5) & (row < grid.height) & (col > -0.5) & (col < grid.width)
-    distance = float(np.median(distances[on_map] if on_map.any() else distances))
-    footprint = pixel_footprint(camera, distance) / grid.gsd
-    wanted = samples or min(MOST_SAMPLES, max(2, math.ceil(footprint)))
-    factor = max(1, int(footprint / wanted))
-    return Window(top, left, bottom - top, right - left), wanted, factor, distance
-
-
-def shell_crossing(origins: Floats, directions: Floats, inner: float, outer: float) -> tuple[Floats, Floats]:
-    """Distances along rays at which they enter and leave the shell between two spheres; NaN where they miss it.
-
-    origins, directions : (n, 3), m and unit; inner, outer : radii, m; returns (n,) each, m
-    """
-    along = (origins * directions).sum(-1)
-    closest2 = (origins * origins).sum(-1) - along**2
-    with np.errstate(invalid="ignore"):
-        half_outer = np.sqrt(outer**2 - closest2)
-        half_inner = np.sqrt(inner**2 - closest2)
-    near = np.maximum(-along - half_outer, 0.0)
-    far = -along + half_outer
-    enters = -along - half_inner
-    far = np.where(enters > 0, enters, far)
-    missed = ~(far > near)
-    return np.where(missed, np.nan, near), np.where(missed, np.nan, far)
-
-
-def no_ground(surface: Surface) -> str:
-    """The error line of a view whose rays all miss valid ground."""
-    return (
-        f"the view misses {surface.path.name}: no pixel sees valid ground; "
-        "check the camera's place, `look_at` (or `quaternion`) and `fov_deg`."
-    )
-
-
-def _misses(surface: Surface) -> str:
-    grid = surface.grid
-    lon, lat = grid.lonlat((grid.height - 1) / 2, (grid.width - 1) / 2)
-    return (
-        f"the view misses {surface.path.name}, whose middle is at longitude {float(lon):.4f}, latitude {float(lat):.4f} deg; "
-        "check the camera's place, `look_at` (or `quaternion`) and `fov_deg`."
-    )
-
-
-def _check_above_ground(surface: Surface, origins: Floats, relief: tuple[float, float]) -> None:
-    """Refuse a camera inside the ground. Raises GeometryError."""
-    grid = surface.grid
-    for origin in (origins[0], origins[-1]):
-        altitude = float(np.linalg.norm(origin)) - grid.radius
-        if altitude > relief[1]:
-            continue
-        lon = math.degrees(math.atan2(origin[1], origin[0]))
-        lat = math.degrees(math.asin(origin[2] / np.linalg.norm(origin)))
-        row, col = (float(v) for v in grid.rowcol_of_lonlat(lon, lat))
-        ground = relief[0]
-        if 0 <= row <= grid.height - 1 and 0 <= col <= grid.width - 1:
-            r, c = min(int(row), grid.height - 2), min(int(col), grid.width - 2)
-            corner = surface.elevation[r : r + 2, c : c + 2]
-            if np.isfinite(corner).all():
-                u, v = col - c, row - r
-                ground = float(np.array([1 - v, v]) @ corner @ np.array([1 - u, u]))
-        if altitude <= ground:
-            raise GeometryError(
-                f"the camera is under the ground: it stands {altitude:.1f} m above the sphere, the ground there at {ground:.1f} m; raise the altitude in `position`."
-            )
 
 
 def make_scene(
@@ -284,26 +116,14 @@ def _blocks(window: Window, field: Callable[[Window], Floats32 | None]) -> Float
     return result
 
 
-def coarsen(values: Floats32, factor: int) -> Floats32:
-    """Means of whole factor x factor blocks, over what is known (NaN where nothing is).
-
-    values : (..., H, W); returns (..., H // factor, W // factor)
-    """
-    height, width = (n // factor for n in values.shape[-2:])
-    blocks = values[..., : height * factor, : width * factor].reshape(*values.shape[:-2], height, factor, width, factor)
-    known = np.isfinite(blocks)
-    count = known.sum(axis=(-3, -1))
-    total = np.where(known, blocks, 0).sum(axis=(-3, -1), dtype=np.float64)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return (total / count).astype(np.float32)
-
-
 def render_view(surface: Surface, camera: Camera, light: Light, scene: Scene) -> Iterator[dict[str, Floats32]]:
     """Bands of image lines from the top down: ``image`` (I/F, mean over each pixel) and backplanes at pixel centres.
 
     NaN where the map is unknown; space is 0. Backplanes are NaN where there is no ground. ``image_std`` is among them where
-    the scene has standard deviations: errors of the ground within a pixel are taken to be alike.
+    the scene has standard deviations: errors of the ground within a pixel are taken to be alike. ``exposed`` is there where
+    the camera moves during its exposure: the mean image over it, while all others are those of its middle.
     """
+    poses = moments(camera, scene.distance)
     lines_at_once = max(1, RAYS_AT_ONCE // (camera.samples * scene.samples**2))
     for first in range(0, camera.lines, lines_at_once):
         count = min(lines_at_once, camera.lines - first)
@@ -320,7 +140,19 @@ def render_view(surface: Surface, camera: Camera, light: Light, scene: Scene) ->
         radiance, clipped = _radiance(surface, scene, fine, light_there)
         band["image"] = _mean(radiance, count, camera.samples, scene.samples)
         band["clipped"] = (_mean(clipped, count, camera.samples, scene.samples) > 0).astype(np.float32)
+        if len(poses) > 1:
+            band["exposed"] = _exposed(surface, light, scene, poses, first, count)
         yield {k: v.reshape(count, camera.samples) for k, v in band.items()}
+
+
+def _exposed(surface: Surface, light: Light, scene: Scene, poses: Sequence[Camera], first: int, count: int) -> Floats32:
+    """(count, samples) I/F, mean over the poses of an exposure; what is unknown in one of them is unknown."""
+    width, total = poses[0].samples, np.zeros(count * poses[0].samples)
+    for pose in poses:
+        rays = _trace(pose, scene, first, count, scene.samples)
+        radiance, _ = _radiance(surface, scene, rays, _light_at(light, scene, rays))
+        total += _mean(radiance, count, width, scene.samples).ravel()
+    return (total / len(poses)).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -344,9 +176,9 @@ def _trace(camera: Camera, scene: Scene, first: int, count: int, samples: int) -
 
 def _rays(camera: Camera, line: Floats, sample: Floats) -> tuple[Floats, Floats]:
     """Like ``camera.rays``, with one origin where all rays leave one point."""
-    if (
-        isinstance(camera, Pinhole) and camera.distortion[0] == NONE
-    ):  # by far the most common, and drawing rays should not take longer than casting them
+    at_once = not isinstance(camera, Moving) or camera.line_time == 0
+    if isinstance(camera, Pinhole) and camera.distortion[0] == NONE and at_once:
+        # by far the most common, and drawing rays should not take longer than casting them
         directions = np.empty((len(line), 3))
         _pinhole_rays(camera.focal_px, camera.principal_point_px, camera.rotation, line, sample, directions)
         return camera.centre[None], directions
@@ -459,24 +291,3 @@ def _fill_backplanes(origins, directions, depth, cos_incidence, cos_emission, ph
         out[4, n] = depth[n]
         out[5, n] = math.atan2(y, x) * degree
         out[6, n] = math.atan2(z, math.hypot(x, y)) * degree
-
-
-def apply_sensor(image: Floats32, light: Light, grid: Grid) -> Floats32:
-    """The sensor's own effects of an extended model, on the whole image of a camera (H, W)."""
-    sensor = [e for e in light.extensions if e.slot == "sensor"]
-    if not sensor:
-        return image
-    known = np.isfinite(image)
-    tensor = torch.from_numpy(np.nan_to_num(image))[None]
-    line, sample = (torch.from_numpy(v.astype(np.float32))[None] for v in np.indices(image.shape))
-    zero = torch.zeros_like(tensor)
-    observation = Observation(
-        zero, torch.tensor([[0.0, 0.0, 1.0]]), torch.zeros(1, 3), grid.gsd, grid.radius,
-        detector_sample=sample, detector_line=line, frame=torch.full((1,), -1),
-    )  # fmt: skip
-    state = State(observation, zero, observation.sun_direction, observation.camera_position, None)
-    state.image = tensor
-    with torch.no_grad():
-        for effect in sensor:
-            effect.apply(state)
-    return np.where(known, state.image[0].numpy(), np.nan).astype(np.float32)

@@ -22,12 +22,18 @@ from stages.common.memory import keep_freed_memory
 from stages.physics.bodies.ephemeris import AU
 from stages.physics.bodies.spheres import find_body
 from stages.physics.cameras import Camera, camera_from_document
+from stages.physics.cameras.pinhole import Pinhole
 from stages.physics.detector import read_sensor
 from stages.physics.detector.readout import photograph
 from stages.physics.terrain.shading import BACKPLANES, Light
-from stages.render.config import CAMERA, SUN, Config, check
-from stages.render.perspective import Grounds, Scene, apply_sensor, make_scene, no_ground, render_view
+from stages.render.chart import axes_about
+from stages.render.config import CAMERA, RATES, SUN, Config, check
+from stages.render.extended import apply_sensor
+from stages.render.grounds import Grounds
+from stages.render.motion import set_in_motion
+from stages.render.perspective import Scene, make_scene, render_view
 from stages.render.setup import camera_place, camera_sun, find_camera, make_light, named_sun, open_source
+from stages.render.sight import no_ground
 
 MOST_SUNS = 4  # whose horizons are kept
 PLANES = ("image", *BACKPLANES)  # of a frame
@@ -40,7 +46,7 @@ class Frame:
     image : I/F, mean over each pixel; NaN where the map is unknown, 0 in space
     incidence_deg, emission_deg, phase_deg : degree; shadow : hidden share of the Sun's disc; depth : m along the ray
     longitude_deg, latitude_deg : degree, of the ground at the pixel's centre
-    camera : as :meth:`Renderer.view` was given it; dn : uint16, of the sensor, None without one
+    camera : as :meth:`Renderer.view` was given it; where it moves, all but ``dn`` are of the middle of the exposure; dn : uint16, of the sensor, None without one
     """
 
     camera: Camera
@@ -99,7 +105,8 @@ class Renderer:
         """The view of a camera.
 
         camera : a camera, the document of one (keys as in a pinhole JSON), or ``position`` (longitude, latitude in degrees,
-            metres above the sphere) with any of ``look_at``, ``quaternion``, ``roll_deg``, ``fov_deg``, ``size_px`` of :class:`Config`
+            metres above the sphere) with any of ``look_at``, ``quaternion``, ``roll_deg``, ``fov_deg``, ``size_px`` of :class:`Config`;
+            ``velocity`` and ``spin_deg`` move it while the sensor takes its picture
         sun : ``sun_azimuth_deg`` and ``sun_elevation_deg``, ``subsolar_longitude_deg`` and ``subsolar_latitude_deg``, or ``time``;
             None for that of the settings, or of the camera
         seed : of the sensor's noise
@@ -112,14 +119,17 @@ class Renderer:
             camera = self.camera(camera)
         light = self.light(config, camera)
         _, bands = self.bands(camera, light, config.samples)
-        planes = _joined(bands)
+        planes = joined(bands)
         if not np.isfinite(planes["depth"]).any():
             raise GeometryError(no_ground(self.surface))
-        dn = None if self.sensor is None else self.photograph(planes["image"], light, seed)
+        dn = None if self.sensor is None else self.photograph(planes, light, seed)
         return Frame(camera, **{name: planes[name] for name in PLANES}, dn=dn)
 
-    def photograph(self, image: Floats32, light: Light, seed: int, view_id: str = "") -> NDArray[np.uint16]:
-        """(lines, samples) DN of the sensor; image : I/F; seed, view_id : of the noise"""
+    def photograph(
+        self, planes: Mapping[str, Floats32], light: Light, seed: int, view_id: str = ""
+    ) -> NDArray[np.uint16]:
+        """(lines, samples) DN of the sensor; planes : of :meth:`bands`, I/F; seed, view_id : of the noise"""
+        image = planes.get("exposed", planes["image"])
         assert self.sensor is not None
         rng = np.random.default_rng([seed, zlib.crc32(view_id.encode())])
         return photograph(self.sensor, image, float(np.linalg.norm(light.sun.position)) / AU, rng)
@@ -127,10 +137,30 @@ class Renderer:
     def camera(self, given: Mapping[str, Any]) -> Camera:
         """The camera of a document or of a pose, see :meth:`view`. Raises LunargrError."""
         if "type" in given or "name_model" in given:
-            return camera_from_document(given, "camera")
+            moves = {name: value for name, value in given.items() if name in RATES}
+            camera = camera_from_document({k: v for k, v in given.items() if k not in moves}, "camera")
+            return self.in_motion(camera, replace(self.config, **read_settings(moves, RATES, "camera")))
         config = replace(self.config, **read_settings(given, CAMERA, "camera"))
         check(config, drawn_sun=True)
-        return find_camera(self.surface, config)
+        return self.find_camera(config)
+
+    def find_camera(self, config: Config) -> Camera:
+        """The camera of a configuration, in motion where that names rates. Raises LunargrError."""
+        return self.in_motion(find_camera(self.surface, config), config)
+
+    def in_motion(self, camera: Camera, config: Config) -> Camera:
+        """A camera that moves by the rates of a configuration while the sensor takes its picture. Raises ConfigError."""
+        given = [name for name in RATES if getattr(config, name) is not None]
+        if not given:
+            return camera
+        if self.sensor is None or not (self.sensor.exposure_s or self.sensor.line_time_s):
+            raise ConfigError(f"`{given[0]}`: expected a sensor with 'exposure_s' or 'line_time_s', found none.")
+        if not isinstance(camera, Pinhole):
+            raise ConfigError(f"`{given[0]}`: expected a pinhole camera, found another, which has its own motion.")
+        up = camera.centre / np.linalg.norm(camera.centre)
+        velocity = np.asarray(config.velocity or (0.0, 0.0, 0.0)) @ axes_about(up)
+        spin = camera.rotation @ np.radians(config.spin_deg or (0.0, 0.0, 0.0))
+        return set_in_motion(camera, velocity, spin, self.sensor)
 
     def light(self, config: Config, camera: Camera | None = None) -> Light:
         """The light that a configuration asks for, seen from the camera; Suns that come back are kept. Raises LunargrError."""
@@ -158,8 +188,9 @@ class Renderer:
         scene = make_scene(self.surface, camera, light, self.relief, samples, errors, self._grounds)
         bands: Iterable[dict[str, Floats32]] = render_view(self.surface, camera, light, scene)
         if any(effect.slot == "sensor" for effect in light.extensions):  # these need the whole image
-            whole = _joined(bands)
-            bands = [whole | {"image": apply_sensor(whole["image"], light, scene.ground.grid)}]
+            whole = joined(bands)
+            named = [name for name in ("image", "exposed") if name in whole]
+            bands = [whole | {name: apply_sensor(whole[name], light, scene.ground.grid) for name in named}]
         return scene, bands
 
 
@@ -174,7 +205,7 @@ def _read(name: str, value: Any, where: str) -> Any:
         if isinstance(value, str):
             return value
         raise ConfigError(f"{where}: '{name}': expected a UTC time as text, found {value!r:.60}.")
-    many = name in ("position", "look_at", "quaternion", "size_px")
+    many = name in ("position", "look_at", "quaternion", "size_px", *RATES)
     numbers = list(value) if many and isinstance(value, (list, tuple)) else [value]
     if not all(isinstance(v, (int, float)) and not isinstance(v, bool) and math.isfinite(v) for v in numbers):
         raise ConfigError(f"{where}: '{name}': expected finite numbers, found {value!r:.60}.")
@@ -184,7 +215,7 @@ def _read(name: str, value: Any, where: str) -> Any:
     return tuple(map(kind, numbers)) if many else float(value)
 
 
-def _joined(bands: Iterable[dict[str, Floats32]]) -> dict[str, Floats32]:
+def joined(bands: Iterable[dict[str, Floats32]]) -> dict[str, Floats32]:
     """All lines at once."""
     parts = list(bands)
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}

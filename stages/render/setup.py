@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,7 @@ from stages.common.brightness import QUANTITIES
 from stages.physics.bodies.ephemeris import AU
 from stages.physics.bodies.spheres import Body
 from stages.physics.cameras import Camera
+from stages.physics.cameras.pinhole import Pinhole
 from stages.physics.images.frame_geometry import open_camera_for
 from stages.physics.light.earth import EARTH_DISTANCE
 from stages.physics.light.sun_disc import SUN_RADIUS
@@ -28,6 +29,7 @@ from stages.physics.terrain.sun_visibility import SunHorizon
 from stages.physics.terrain.surface import Surface, open_surface, open_terrain
 from stages.render.config import LARGEST_VIEW, SUN, Config
 from stages.render.files import inputs
+from stages.render.sight import ground_height
 from stages.render.viewpoint import look_at, pinhole_view, place, rotation_from_quaternion
 
 
@@ -138,8 +140,10 @@ def find_camera(surface: Surface, config: Config) -> Camera:
 
 
 def _camera(surface: Surface, config: Config) -> Camera:
-    if config.camera:
-        return open_camera_for(Path(config.camera), surface.grid.radius)
+    """A model from a file, with its own pose or, where a position is given, with that pose; or a pinhole from its field of view."""
+    model = open_camera_for(Path(config.camera), surface.grid.radius) if config.camera else None
+    if model is not None and config.position is None:
+        return model
     grid = surface.grid
     lon, lat, altitude = _three(config.position or (), "`position`")
     position = place(lon, lat, altitude, grid.radius)
@@ -149,19 +153,19 @@ def _camera(surface: Surface, config: Config) -> Camera:
         target = config.look_at if config.look_at is not None else (lon, lat)
         if len(target) not in (2, 3):
             raise ConfigError(f"`look_at`: expected LON,LAT or LON,LAT,ALT, found {len(target)} numbers.")
-        height = target[2] if len(target) == 3 and math.isfinite(target[2]) else _ground_height(surface, *target[:2])
+        height = (
+            target[2]
+            if len(target) == 3 and math.isfinite(target[2])
+            else ground_height(surface, target[0], target[1], 0.0)
+        )
         rotation = look_at(position, place(target[0], target[1], height, grid.radius), config.roll_deg)
+    if model is not None:
+        if not isinstance(model, Pinhole):
+            raise ConfigError(
+                f"{config.camera}: expected a pinhole camera for the poses of a trajectory, found a {model.kind} camera."
+            )
+        return replace(model, centre=position, rotation=rotation)
     return pinhole_view(position, rotation, config.fov_deg, config.size_px, grid.radius)
-
-
-def _ground_height(surface: Surface, longitude_deg: float, latitude_deg: float) -> float:
-    """Height of the nearest pixel, 0 off the map or where it is unknown."""
-    row, col = (float(v) for v in surface.grid.rowcol_of_lonlat(longitude_deg, latitude_deg))
-    if not (-0.5 <= row < surface.grid.height - 0.5 and -0.5 <= col < surface.grid.width - 0.5):
-        return 0.0
-    r, c = round(row), round(col)
-    value = float(surface.elevation[r : r + 1, c : c + 1][0, 0])
-    return value if math.isfinite(value) else 0.0
 
 
 def camera_sun(camera: Camera) -> NDArray[np.float64] | None:

@@ -9,7 +9,6 @@ from stages.render.config import Config, Summary
 from stages.render.files import output_files
 from stages.render.ortho import render_map
 from stages.render.renderer import Renderer
-from stages.render.setup import find_camera
 from stages.render.views import render_camera
 
 
@@ -19,5 +18,5 @@ def work(source: Path, path: Path, config: Config, progress: Progress) -> Summar
     with Renderer(source, config=config) as renderer:
         if config.view == "ortho":
             return render_map(renderer.surface, renderer.light(config), renderer.relief, files, config, progress)
-        camera = find_camera(renderer.surface, config)
+        camera = renderer.find_camera(config)
         return render_camera(renderer, camera, files, config, path.stem, progress)

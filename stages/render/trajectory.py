@@ -17,6 +17,7 @@ _NUMBERS = (
     "longitude_deg",
     "latitude_deg",
     "altitude_m",
+    "height_m",
     "look_longitude_deg",
     "look_latitude_deg",
     "look_altitude_m",
@@ -28,6 +29,7 @@ _NUMBERS = (
     "sun_azimuth_deg",
     "sun_elevation_deg",
     "solar_distance_au",
+    "time_s",
 )
 _KNOWN = ("view_id", "time", *_NUMBERS)
 
@@ -36,16 +38,20 @@ _KNOWN = ("view_id", "time", *_NUMBERS)
 class ViewRow:
     """One row: place and target (degrees, degrees, metres above the sphere) or attitude, and what replaces the command's options.
 
+    height : m above the ground, in place of the position's altitude, or None
+    seconds : since any moment, of the row's pose; None where it has no time
     fov_deg : None for the command's own; sun : fields of ``Config`` by name, empty for the command's own Sun
     """
 
     view_id: str
     position: tuple[float, float, float]
+    height: float | None
     look_at: tuple[float, float, float] | None
     quaternion: tuple[float, float, float, float] | None
     roll_deg: float
     fov_deg: float | None
     sun: dict[str, float | str]
+    seconds: float | None = None
 
 
 def read_trajectory(path: Path) -> list[ViewRow]:
@@ -54,7 +60,7 @@ def read_trajectory(path: Path) -> list[ViewRow]:
     lines = [line for line in read_text(path, what).splitlines() if not line.lstrip().startswith("#")]
     names, records = parse_csv(path, "\n".join(lines), what)
     for name in ("longitude_deg", "latitude_deg", "altitude_m"):
-        if name not in names:
+        if name not in names and not (name == "altitude_m" and "height_m" in names):
             raise InputError(f"{path}: expected a column '{name}', found {', '.join(names) or 'nothing'}; add it.")
     unknown = [name for name in names if name not in _KNOWN]
     if unknown:
@@ -90,7 +96,10 @@ def _row(path: Path, number: int, record: dict[str | None, Any]) -> ViewRow:
             value[name] = math.nan
         if not math.isfinite(value[name]):
             raise InputError(f"{where}: expected a number in column '{name}', found '{text[name]}'; correct it.")
-    for name in ("longitude_deg", "latitude_deg", "altitude_m"):
+    if "altitude_m" in value and "height_m" in value:
+        raise InputError(f"{where}: expected altitude_m (above the sphere) or height_m (above the ground), found both.")
+    altitude = "height_m" if "height_m" in value else "altitude_m"
+    for name in ("longitude_deg", "latitude_deg", altitude):
         if name not in value:
             raise InputError(f"{where}: expected a number in column '{name}', found nothing; fill it in.")
     look_at = None
@@ -118,10 +127,24 @@ def _row(path: Path, number: int, record: dict[str | None, Any]) -> ViewRow:
         )
     return ViewRow(
         view_id=view_id,
-        position=(value["longitude_deg"], value["latitude_deg"], value["altitude_m"]),
+        position=(value["longitude_deg"], value["latitude_deg"], value.get("altitude_m", math.nan)),
+        height=value.get("height_m"),
         look_at=look_at,
         quaternion=quaternion,  # type: ignore[arg-type]
         roll_deg=value.get("roll_deg", 0.0),
         fov_deg=value.get("fov_deg"),
         sun=sun,
+        seconds=_seconds(value, text, where),
     )
+
+
+def _seconds(value: dict[str, float], text: dict[str, str], where: str) -> float | None:
+    """When the row's pose is taken, s: from ``time_s``, else from ``time``. Raises InputError."""
+    if "time_s" in value or not text.get("time"):
+        return value.get("time_s")
+    from stages.physics.bodies.ephemeris import utc_to_et  # slow to import
+
+    try:
+        return utc_to_et(text["time"])
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None

@@ -6,28 +6,26 @@ import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 
-from schemas.errors import GeometryError, LunargrError
+from schemas.errors import ConfigError, GeometryError
 from schemas.files.companions import companions_of
 from schemas.files.locks import claim
 from schemas.files.outputs import Output
 from stages.common.arrays import Floats32
 from stages.common.progress import Progress, show_nothing
 from stages.physics.cameras.base import Camera
-from stages.physics.cameras.pinhole import Pinhole
 from stages.physics.terrain.shading import BACKPLANES
-from stages.render.config import SUN, Config, Summary
+from stages.render.config import Config, Summary
 from stages.render.dataset import EXPORT_PASSES, View, camera_facts, export_views, write_cameras
-from stages.render.files import CAMERAS, finished, shard_of_views, view_files
-from stages.render.perspective import no_ground
+from stages.render.files import CAMERAS, finished, view_files
+from stages.render.flight import find_flight, named_row
 from stages.render.pictures import Preview, write_dn, write_exr, write_png
-from stages.render.renderer import Renderer
-from stages.render.setup import find_camera, metadata
+from stages.render.renderer import Renderer, joined
+from stages.render.setup import metadata
+from stages.render.sight import no_ground
 from stages.render.tally import Tally
-from stages.render.trajectory import ViewRow
 
 EACH = 3  # work of rendering a view, in passes of its export
 
@@ -36,35 +34,34 @@ def render_trajectory(source: Path, table: Path, output: Output, config: Config,
     """See :func:`stages.render.run_trajectory`."""
     folder = output.file
     config = replace(config, view="pinhole")
-    views = shard_of_views(table, config)
-    outputs = {view.view_id: view_files(folder, view.view_id, config) for view in views}
-    done = finished(outputs) if output.resume else set()
+    index, count = config.shard
     results: list[Summary] = []
-    total = (EACH + EXPORT_PASSES * len(config.export)) * len(views)
     with Renderer(source, config=config) as renderer:
-        surface = renderer.surface
-        for number, view in enumerate(views):
+        if config.export and renderer.sensor is not None and renderer.sensor.line_time_s:
+            raise ConfigError(
+                "`export`: expected a sensor without 'line_time_s'; data sets hold one pose for a picture."
+            )
+        flight = find_flight(renderer, config, table)
+        frames = flight[index::count]
+        outputs = {frame.view_id: view_files(folder, frame.view_id, config) for frame in frames}
+        done = finished(outputs) if output.resume else set()
+        total = (EACH + EXPORT_PASSES * len(config.export)) * len(frames)
+        for number, (view_id, camera, view_config) in enumerate(frames):
             progress(EACH * number, total, "views")
-            if view.view_id in done:
-                results.append(Summary(view.view_id, tuple(outputs[view.view_id]), config.size_px, skipped=True))
+            files = outputs[view_id]
+            if view_id in done:
+                results.append(Summary(view_id, tuple(files), (camera.samples, camera.lines), skipped=True))
                 continue
-            view_config = _with_row(config, view)
-            try:
-                camera = find_camera(surface, view_config)
-                files = outputs[view.view_id]
-                with claim(files[0]), companions_of(files[0]):
-                    results.append(render_camera(renderer, camera, files, view_config, view.view_id, show_nothing))
-            except LunargrError as error:
-                raise type(error)(f"{table.name}, {view.view_id}: {error}") from None
-        rows = [_with_row(config, view) for view in views]
-        cameras = [cast(Pinhole, find_camera(surface, row)) for row in rows]
-        if config.shard[1] == 1 and not (output.resume and (folder / CAMERAS).exists()):
-            suns = [renderer.sun(row) for row in rows]
-            write_cameras(folder / CAMERAS, [v.view_id for v in views], cameras, suns, surface.grid)
-        rendered = [View(v.view_id, c, outputs[v.view_id][0]) for v, c in zip(views, cameras, strict=True)]
+            with named_row(table, view_id), claim(files[0]), companions_of(files[0]):
+                results.append(render_camera(renderer, camera, files, view_config, view_id, show_nothing))
+        cameras = [frame.camera for frame in frames]
+        if count == 1 and not (output.resume and (folder / CAMERAS).exists()):
+            suns = [renderer.sun(frame.config) for frame in frames]
+            write_cameras(folder / CAMERAS, list(outputs), cameras, suns, renderer.surface.grid)
+        rendered = [View(view_id, camera, outputs[view_id][0]) for view_id, camera, _ in frames]
         for number, kind in enumerate(config.export):
-            before = (EACH + EXPORT_PASSES * number) * len(views)
-            export_views(rendered, surface.grid, folder, kind, _counted_on(progress, before, total))
+            before = (EACH + EXPORT_PASSES * number) * len(frames)
+            export_views(rendered, renderer.surface.grid, folder, kind, _counted_on(progress, before, total))
     progress(total, total, "views")
     return results
 
@@ -72,21 +69,6 @@ def render_trajectory(source: Path, table: Path, output: Output, config: Config,
 def _counted_on(progress: Progress, before: int, total: int) -> Callable[[int], None]:
     """Progress of an export, after ``before`` steps of the whole."""
     return lambda done: progress(before + done, total, "export")
-
-
-def _with_row(config: Config, view: ViewRow) -> Config:
-    """The configuration of one row: what the row leaves empty stays as it is; a row's Sun replaces the whole Sun."""
-    view_config = replace(
-        config,
-        position=view.position,
-        look_at=view.look_at if view.look_at is not None or view.quaternion is not None else config.look_at,
-        quaternion=view.quaternion,
-        roll_deg=view.roll_deg,
-        fov_deg=view.fov_deg if view.fov_deg is not None else config.fov_deg,
-    )
-    if view.sun:
-        view_config = replace(view_config, **{**dict.fromkeys(SUN), **view.sun})  # type: ignore[arg-type]
-    return view_config
 
 
 def render_camera(
@@ -100,7 +82,7 @@ def render_camera(
     """One view, streamed to its files band by band."""
     surface, light = renderer.surface, renderer.light(config, camera)
     named = {path.suffix.lower(): path for path in files}
-    parts: list[Floats32] = []  # of the image, where a sensor takes it as a whole
+    parts: list[dict[str, Floats32]] = []  # where a sensor takes the image as a whole
     errors = surface.knows_errors and ".exr" in named
     scene, bands = renderer.bands(camera, light, config.samples, errors)
     channels = ["image", *(["image_std"] if errors else []), *BACKPLANES]
@@ -115,7 +97,7 @@ def render_camera(
                 exr.write(band)
             preview.add(band["image"])
             if renderer.sensor is not None:
-                parts.append(band["image"])
+                parts.append({name: band[name] for name in ("image", "exposed") if name in band})
             tally.add(band)
             ground |= bool(np.isfinite(band["depth"]).any())
             done += len(band["image"])
@@ -124,6 +106,6 @@ def render_camera(
             raise GeometryError(no_ground(surface))
         write_png(named[".png"], preview.image())
     if renderer.sensor is not None:
-        write_dn(named[".tif"], renderer.photograph(np.concatenate(parts), light, config.seed, view_id))
+        write_dn(named[".tif"], renderer.photograph(joined(parts), light, config.seed, view_id))
     summary = tally.summary(view_id, files, (camera.samples, camera.lines), scene.samples)
     return replace(summary, pixels_per_post=scene.pixels_per_post)

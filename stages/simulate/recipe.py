@@ -216,8 +216,11 @@ def _check(config: Config, where: str) -> None:
             f"found a range up to {config.incidence_deg[1]:g}; raise it or move the scene."
         )
     config.hidden_effects()
-    if config.sensor_model() is not None:
+    sensor = config.sensor_model()
+    if sensor is not None:
         _require(config.units == "dn", where, "units", "'dn' with 'sensor'", f"'{config.units}'")
+        _require(sensor.psf_kernel is None, where, "sensor", "optics as 'psf_sigma_px'", "'psf_kernel'")
+        _require(sensor.line_time_s == 0, where, "sensor", "one exposure for the image", "'line_time_s'")
 
 
 def _require(good: bool, where: str, key: str, expected: str, found: str) -> None:

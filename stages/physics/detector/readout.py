@@ -33,6 +33,9 @@ def noise_electrons(charge: Floats32, read_noise: float, rng: np.random.Generato
 
 def blur(sensor: Sensor, image: Floats32) -> Floats32:
     """The image behind the optics, the same light in sum; image : (H, W) I/F."""
+    if sensor.psf_kernel is not None:
+        turned = np.asarray(sensor.psf_kernel)[::-1, ::-1]  # OpenCV correlates
+        return np.asarray(cv2.filter2D(image, cv2.CV_32F, turned, borderType=cv2.BORDER_REFLECT), np.float32)
     if sensor.psf_sigma_px == 0:
         return image
     return np.asarray(cv2.GaussianBlur(image, (0, 0), sensor.psf_sigma_px, borderType=cv2.BORDER_REFLECT), np.float32)

@@ -15,6 +15,8 @@ PRESETS = Path(__file__).parent / "presets"
 SUN_TEMPERATURE = 5772.0  # K, nominal (IAU 2015, resolution B3)
 HC_OVER_K = 0.014387769  # m K, second radiation constant (CODATA 2018)
 TWO_C = 2 * 299792458.0  # m/s
+LARGEST_KERNEL = 255  # px
+Kernel = tuple[tuple[float, ...], ...]
 _RADIOMETRY = ("f_number", "pixel_um", "wavelength_nm", "bandwidth_nm", "quantum_efficiency")
 
 
@@ -31,11 +33,14 @@ class Sensor:
     """The keys of a sensor file; those left out do nothing.
 
     full_well : e-; gain : e-/DN (absent: the full well fills all DN); bits : of a DN; offset_dn : DN without light
-    exposure_s : s, or auto_level : share of full scale that the image's 99.5th percentile takes (0.7 where neither is given)
+    exposure_s : s; auto_level : share of full scale that the image's 99.5th percentile takes (0.7 where neither is given); with both, the
+        time is kept and a filter or the gain gives the level
+    line_time_s : s from one line's exposure to that of the next (rolling shutter)
     quantum_efficiency, transmission : 0..1, of detector and optics; f_number; pixel_um; wavelength_nm, bandwidth_nm : of the band
     read_noise : e-; dark_signal : e-/s; dsnu : its relative standard deviation from pixel to pixel
     prnu : relative standard deviation of the response from pixel to pixel; column_pattern : rms of smooth waves over the columns
-    psf_sigma_px : of a Gaussian; vignetting : share of the light that the corners lose, growing with the square of the distance
+    psf_sigma_px : of a Gaussian, or psf_kernel : (odd, odd) weights by lines and samples, or a file of them (.npy, or text), brought to sum 1
+    vignetting : share of the light that the corners lose, growing with the square of the distance
     seed : of the fixed patterns; source : where the numbers come from
     """
 
@@ -57,6 +62,8 @@ class Sensor:
     prnu: float = 0.0
     column_pattern: float = 0.0
     psf_sigma_px: float = 0.0
+    psf_kernel: Kernel | None = None
+    line_time_s: float = 0.0
     vignetting: float = 0.0
     seed: int = 0
     source: str = ""
@@ -96,11 +103,11 @@ class Sensor:
     def expose(self, level: float, distance_au: float = 1.0) -> Exposure:
         """level : I/F that automatic exposure brings to ``auto_level``"""
         rate = self.rate(distance_au)
-        if self.exposure_s is not None:
+        if self.exposure_s is not None and self.auto_level is None:
             return Exposure(rate * self.exposure_s, self.exposure_s)
         share = 0.7 if self.auto_level is None else self.auto_level
         electrons = share * self.full_scale / max(level, 1e-6)
-        return Exposure(electrons, electrons / rate)
+        return Exposure(electrons, electrons / rate if self.exposure_s is None else self.exposure_s)
 
 
 def preset_names() -> list[str]:
@@ -129,12 +136,44 @@ def read_sensor(given: str) -> Sensor:
     known = {f.name: f for f in dataclasses.fields(Sensor)}
     check_keys(values, list(known), str(path))
     for name, value in values.items():
-        _check_value(name, value, str(path))
+        if name != "psf_kernel":
+            _check_value(name, value, str(path))
     if "full_well" not in values:
         raise InputError(f"{path}: expected the key 'full_well' (electrons), found none; add it.")
+    if "psf_kernel" in values:
+        values = {**values, "psf_kernel": _read_kernel(values["psf_kernel"], path)}
     sensor = Sensor(**values)
     _check(sensor, str(path))
     return sensor
+
+
+def _read_kernel(given: Any, where: Path) -> Kernel:
+    """The weights of a point-spread function, in a sensor's file or one beside it. Raises InputError."""
+    import numpy as np
+
+    from schemas.files.user_files import check_file
+
+    told = f"{where}: 'psf_kernel'"
+    try:
+        if isinstance(given, str):
+            file = where.parent / given
+            check_file(file, "a point-spread function")
+            numbers = np.load(file, allow_pickle=False) if file.suffix == ".npy" else np.loadtxt(file, delimiter=None)
+            weights = np.asarray(numbers, float)
+        else:
+            weights = np.array(given, float)
+    except (ValueError, TypeError, OSError, EOFError) as error:
+        raise InputError(
+            f"{told}: expected rows of numbers, found others ({' '.join(str(error).split()):.60})."
+        ) from None
+    if weights.ndim != 2 or not all(n % 2 == 1 and n <= LARGEST_KERNEL for n in weights.shape):
+        raise InputError(
+            f"{told}: expected an odd number of rows and columns, {LARGEST_KERNEL} at most, found shape {weights.shape}; mend it."
+        )
+    total = float(weights.sum())
+    if not (np.isfinite(weights).all() and (weights >= 0).all() and total > 0):
+        raise InputError(f"{told}: expected weights of at least 0 with a sum above 0, found others; mend it.")
+    return tuple(map(tuple, (weights / total).tolist()))
 
 
 # key -> lowest and highest value
@@ -143,7 +182,7 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "auto_level": (1e-3, 10), "quantum_efficiency": (1e-6, 1), "transmission": (1e-6, 1), "f_number": (0.1, 1000),
     "pixel_um": (0.1, 1000), "wavelength_nm": (100, 1e5), "bandwidth_nm": (0.01, 1e5), "read_noise": (0, 1e6),
     "dark_signal": (0, 1e9), "dsnu": (0, 10), "prnu": (0, 0.5), "column_pattern": (0, 0.5), "psf_sigma_px": (0, 50),
-    "vignetting": (0, 1), "seed": (0, 2**63 - 1),
+    "line_time_s": (0, 10), "vignetting": (0, 1), "seed": (0, 2**63 - 1),
 }  # fmt: skip
 
 
@@ -162,14 +201,17 @@ def _check_value(name: str, value: Any, where: str) -> None:
 
 def _check(sensor: Sensor, where: str) -> None:
     """Refuse keys that do not go together. Raises ConfigError."""
-    if sensor.exposure_s is not None and sensor.auto_level is not None:
-        raise ConfigError(f"{where}: expected 'exposure_s' or 'auto_level', found both; keep one.")
+    if sensor.psf_kernel is not None and sensor.psf_sigma_px:
+        raise ConfigError(f"{where}: expected 'psf_sigma_px' or 'psf_kernel', found both; keep one.")
     if sensor.offset_dn >= sensor.top:
         raise ConfigError(
             f"{where}: 'offset_dn': expected less than {sensor.top}, found {sensor.offset_dn:g}; mend it."
         )
     missing = [name for name in _RADIOMETRY if getattr(sensor, name) is None]
-    needs = "exposure_s" if sensor.exposure_s is not None else "dark_signal" if sensor.dark_signal else ""
+    metered = sensor.auto_level is not None
+    needs = "exposure_s" if sensor.exposure_s is not None and not metered else ""
+    if sensor.dark_signal and sensor.exposure_s is None:
+        needs = "dark_signal"
     if needs and missing:
         raise ConfigError(
             f"{where}: '{needs}': expected with {', '.join(missing)}, which give the electrons in a second; add them."
