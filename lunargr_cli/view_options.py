@@ -181,6 +181,12 @@ Export = Annotated[
         help="With --trajectory: also write these data sets.",
     ),
 ]
+Rig = Annotated[
+    float | None,
+    typer.Option(
+        "--rig", metavar="M", help="Two parallel cameras this far apart under one Sun, with --trajectory or --stereo."
+    ),
+]
 PngOnly = Annotated[bool, typer.Option("--png-only", help="With --trajectory: write no EXR files.")]
 # Stereo pairs
 Stereo = Annotated[

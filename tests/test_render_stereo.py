@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 from relief import hills
-from render_scene import lunargr_render, make_grid, smooth_maps, write_svbrdf
+from render_scene import SUN, lunargr_render, make_grid, smooth_maps, write_svbrdf
 
 from stages.render.pictures import read_exr
 
@@ -94,3 +94,50 @@ def test_stereo_pairs_replace_no_file_unless_told_to(wide_map, tmp_path, monkeyp
     assert list(own.parent.iterdir()) == [own] and own.read_text() == "somebody's own"
     assert lunargr_render(monkeypatch, capsys, wide_map, *arguments, "--overwrite")[0] == 0
     assert len(list(own.parent.iterdir())) == 3 * 5 + 1
+
+
+def test_a_rig_has_two_parallel_cameras_under_one_sun(wide_map, tmp_path, monkeypatch, capsys):
+    """Over level ground a disparity is focal length x baseline / depth."""
+    size = ("--size", "64,64", "--fov", "10", "--rig", "30", "-q")
+    code, error = lunargr_render(monkeypatch, capsys, wide_map, "--stereo", "3", *size, "-o", tmp_path / "s")
+    assert code == 0, error
+    for pair in json.loads((tmp_path / "s" / "manifest.json").read_text())["pairs"]:
+        left, right = pair["left"]["camera"], pair["right"]["camera"]
+        assert left["rotation_camera_to_mcmf"] == right["rotation_camera_to_mcmf"]
+        assert pair["baseline"] == pytest.approx(30.0)
+        assert pair["left"]["sun_azimuth_deg"] == pair["right"]["sun_azimuth_deg"]
+        matches, depth = (read_exr(tmp_path / "s" / name) for name in (pair["matches"], pair["left"]["image"]))
+        line, sample = np.indices(depth["depth"].shape) + 0.5
+        focal = left["focal_px"][0]
+        along = depth["depth"] / np.sqrt(1 + ((line - 32) ** 2 + (sample - 32) ** 2) / focal**2)
+        np.testing.assert_allclose(sample - matches["sample"], focal * 30.0 / along, atol=1e-3)
+        np.testing.assert_allclose(matches["line"], line, atol=1e-3)
+
+
+def test_a_trajectory_on_a_rig_has_two_views_a_row(wide_map, tmp_path, monkeypatch, capsys):
+    (tmp_path / "t.csv").write_text("view_id,longitude_deg,latitude_deg,altitude_m\na,-42,17,3000\nb,-42,17,2000\n")
+    view = ("--trajectory", tmp_path / "t.csv", "--rig", "0.5", "--size", "24,24", "--fov", "5", *SUN, "-q")
+    for shard in ("1/2", "2/2"):
+        code, error = lunargr_render(monkeypatch, capsys, wide_map, *view, "-o", tmp_path / "v", "--shard", shard)
+        assert code == 0, error
+    code, error = lunargr_render(monkeypatch, capsys, wide_map, *view, "-o", tmp_path / "v", "--resume")
+    assert code == 0, error
+    views = json.loads((tmp_path / "v" / "cameras.json").read_text())["views"]
+    assert [v["view_id"] for v in views] == ["a_left", "a_right", "b_left", "b_right"]
+    apart = np.subtract(views[1]["position_mcmf"], views[0]["position_mcmf"])
+    np.testing.assert_allclose(apart, 0.5 * np.array(views[0]["rotation_camera_to_mcmf"])[:, 0], atol=1e-6)
+    assert len(list((tmp_path / "v").glob("*.exr"))) == 4
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("--rig", "0.5", "--position", "-42,17,3000"),
+        ("--rig", "-1", "--stereo", "1"),
+        ("--rig", "1", "--stereo", "1", "--convergence", "5,6"),
+    ],
+)
+def test_a_rig_that_cannot_be_is_refused(wide_map, tmp_path, monkeypatch, capsys, arguments):
+    sun = SUN if "--position" in arguments else ()
+    code, error = lunargr_render(monkeypatch, capsys, wide_map, *arguments, *sun, "-o", tmp_path / "x")
+    assert code == 3 and "--rig" in error and error.count("\n") == 1

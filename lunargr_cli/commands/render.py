@@ -42,6 +42,7 @@ from lunargr_cli.view_options import (
     Position,
     Quaternion,
     RenderOutput,
+    Rig,
     Roll,
     Samples,
     Sensor,
@@ -96,6 +97,7 @@ def command(
     samples: Samples = None,
     trajectory: Trajectory = None,
     export: Export = None,
+    rig: Rig = None,
     stereo: Stereo = None,
     altitude: Altitude = None,
     convergence: Convergence = CONVERGENCE,
@@ -157,6 +159,10 @@ def _mode(given: Options) -> str:
         if given["resume"] or any(given[name] is not None for name in own):
             raise ConfigError(
                 "--stereo: expected without a camera's place and attitude, --trajectory, --shard and --resume; it draws its own."
+            )
+        if given["rig"] is not None and given["convergence"] != CONVERGENCE:
+            raise ConfigError(
+                "--convergence: expected without --rig, whose cameras are parallel; leave one of them out."
             )
         return mode
     if given["altitude"] is not None:

@@ -35,14 +35,15 @@ CAMERA = (
 # What each kind of view does not look at: set all the same, it would be ignored.
 _ATTITUDE = ("look_at", "quaternion", "roll_deg", "fov_deg", "size_px")
 IGNORED = {
-    "`view` ortho": (*_ATTITUDE, *RATES, "samples", "sensor", "png_only"),
-    "`camera`": (*_ATTITUDE, "position", "backplanes_in_tif", "png_only"),
+    "`view` ortho": (*_ATTITUDE, *RATES, "samples", "sensor", "png_only", "rig"),
+    "`camera`": (*_ATTITUDE, "position", "backplanes_in_tif", "png_only", "rig"),
     "a trajectory": ("position", "quaternion", "roll_deg", *RATES, "backplanes_in_tif"),
     "`camera` in a trajectory": ("fov_deg", "size_px"),
-    "`view` pinhole": ("backplanes_in_tif", "png_only"),
+    "`view` pinhole": ("backplanes_in_tif", "png_only", "rig"),
     "`quaternion`": ("look_at", "roll_deg"),
 }
 
+LARGEST_RIG = 1e6  # m
 LARGEST_VIEW = 1 << 30  # pixels; an EXR of them has 4 GB a channel
 
 
@@ -58,6 +59,7 @@ class Config:
     sensor : a preset's name or a JSON file: DN beside the I/F, with noise drawn from ``seed`` and the view's name
     samples : rays per pixel and axis (None: as many as the pixel's footprint asks for)
     model, parameters : a reflectance that is the same everywhere, where the source holds none
+    rig : m from a left camera to a right one beside it: two views of each row of a trajectory, or how stereo pairs are drawn
     export : with a trajectory: also data sets of its views, of EXPORTS; png_only : no EXR; shard : every n-th view
     bounce : light that sunlit terrain throws on other terrain, once, between diffuse facets
     earthshine : the Earth's light, from its place at ``time``, or at an azimuth and elevation over the map's middle
@@ -94,6 +96,7 @@ class Config:
     extend: str | None = None
     body: str | None = None
     backplanes_in_tif: bool = False
+    rig: float | None = None
     export: tuple[str, ...] = ()
     png_only: bool = False
     shard: tuple[int, int] = (0, 1)
@@ -171,6 +174,7 @@ def check(config: Config, trajectory: bool = False, drawn_sun: bool = False) -> 
             raise ConfigError(f"`export`: expected any of {', '.join(EXPORTS)}, each once; found '{kind}'.")
     kind = "a trajectory" if trajectory else "`camera`" if config.camera else f"`view` {config.view}"
     refuse_ignored(config, kind)
+    check_rig(config)
     for name in RATES:
         rate = getattr(config, name)
         if rate is not None and config.sensor is None:
@@ -183,6 +187,12 @@ def check(config: Config, trajectory: bool = False, drawn_sun: bool = False) -> 
         raise ConfigError("`view` pinhole: expected `position` LON,LAT,ALT or `camera` FILE; found neither.")
     if config.quaternion is not None:
         refuse_ignored(config, "`quaternion`")
+
+
+def check_rig(config: Config) -> None:
+    """Raises ConfigError for a baseline that cannot be."""
+    if config.rig is not None and not 0 < config.rig < LARGEST_RIG:
+        raise ConfigError(f"`rig`: expected metres between both cameras, found {config.rig:g}.")
 
 
 def check_trajectory(config: Config) -> None:

@@ -6,16 +6,13 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from schemas.errors import ConfigError
 from schemas.files.locks import claim
 from schemas.files.outputs import Target
 from stages.common.runner import Call
 from stages.render.config import Config, Summary
-
-if TYPE_CHECKING:
-    from stages.render.trajectory import ViewRow
 
 CAMERAS = "cameras.json"  # of a trajectory
 DN = "_dn.tif"  # ends the name of a sensor's image
@@ -78,12 +75,18 @@ def view_files(folder: Path, view_id: str, config: Config) -> list[Path]:
     return output_files(folder / f"{view_id}{'.png' if config.png_only else '.exr'}", replace(config, view="pinhole"))
 
 
-def shard_of_views(table: Path, config: Config) -> list[ViewRow]:
-    """The views of a shard: every n-th."""
+SIDES = ("left", "right")  # of stereo
+
+
+def shard_of_views(table: Path, config: Config) -> list[str]:
+    """The names of a shard's views: every n-th of those of all rows."""
     from stages.render.trajectory import read_trajectory
 
     index, count = config.shard
-    return read_trajectory(table)[index::count]
+    names = [row.view_id for row in read_trajectory(table)]
+    if config.rig is not None:
+        names = [f"{name}_{side}" for name in names for side in SIDES]
+    return names[index::count]
 
 
 def finished(outputs: Mapping[str, Sequence[Path]]) -> set[str]:
@@ -94,9 +97,7 @@ def finished(outputs: Mapping[str, Sequence[Path]]) -> set[str]:
 def trajectory_targets(call: Call) -> list[Target]:
     """The files of the views that are still to be rendered, and of the data set that is exported."""
     folder, config = call.output.file, call.config
-    outputs = {
-        v.view_id: view_files(folder, v.view_id, config) for v in shard_of_views(call.arguments["table"], config)
-    }
+    outputs = {name: view_files(folder, name, config) for name in shard_of_views(call.arguments["table"], config)}
     done = finished(outputs) if call.output.resume else set()
     new = [files for name, files in outputs.items() if name not in done]
     new += [export_files(list(outputs), folder, kind) for kind in config.export]
@@ -131,7 +132,7 @@ def pair_names(count: int) -> list[str]:
 
 def pair_files(folder: Path, name: str, config: Config) -> list[Path]:
     """Of the left view, of the right one, and the correspondences."""
-    views = [path for side in ("left", "right") for path in view_files(folder, f"{name}_{side}", config)]
+    views = [path for side in SIDES for path in view_files(folder, f"{name}_{side}", config)]
     return [*views, folder / f"{name}_matches.exr"]
 
 

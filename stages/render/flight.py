@@ -11,6 +11,7 @@ from typing import NamedTuple, cast
 from schemas.errors import ConfigError, LunargrError
 from stages.physics.cameras.pinhole import Pinhole
 from stages.render.config import SUN, Config
+from stages.render.files import SIDES
 from stages.render.motion import rates, set_in_motion
 from stages.render.renderer import Renderer
 from stages.render.setup import find_camera
@@ -35,7 +36,15 @@ def find_flight(renderer: Renderer, config: Config, table: Path) -> list[Shot]:
             row_config = _with_row(renderer, config, row)
             frames.append(Shot(row.view_id, cast(Pinhole, find_camera(renderer.surface, row_config)), row_config))
     cameras = _in_motion(renderer, [frame.camera for frame in frames], rows, table)
-    return [frame._replace(camera=camera) for frame, camera in zip(frames, cameras, strict=True)]
+    moving = [frame._replace(camera=camera) for frame, camera in zip(frames, cameras, strict=True)]
+    return moving if config.rig is None else [shot for frame in moving for shot in _both_sides(frame, config.rig)]
+
+
+def _both_sides(shot: Shot, baseline: float) -> list[Shot]:
+    """A camera and the one ``baseline`` m to its right."""
+    view_id, camera, config = shot
+    right = replace(camera, centre=camera.centre + baseline * camera.rotation[:, 0])
+    return [Shot(f"{view_id}_{side}", each, config) for side, each in zip(SIDES, (camera, right), strict=True)]
 
 
 @contextlib.contextmanager

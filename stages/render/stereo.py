@@ -19,9 +19,9 @@ from stages.common.arrays import Floats, Floats32
 from stages.common.progress import Progress, show_nothing
 from stages.physics.cameras.pinhole import Pinhole
 from stages.physics.terrain.surface import Surface
-from stages.render.config import SUN, Config, StereoConfig, check
+from stages.render.config import SUN, Config, StereoConfig, check, check_rig
 from stages.render.dataset import World, make_world, project, ray_directions, write_text
-from stages.render.files import MANIFEST, pair_files, pair_names, view_files
+from stages.render.files import MANIFEST, SIDES, pair_files, pair_names, view_files
 from stages.render.pictures import read_exr, write_exr
 from stages.render.renderer import Renderer
 from stages.render.viewpoint import look_at, pinhole_view
@@ -39,7 +39,7 @@ def render_stereo(source: Path, folder: Path, config: Config, stereo: StereoConf
     _check(config, stereo)
     manifest = folder / MANIFEST
     names = pair_names(stereo.count)
-    view_config = replace(config, view="pinhole", position=(0.0, 0.0, 0.0))
+    view_config = replace(config, view="pinhole", position=(0.0, 0.0, 0.0), rig=None)
     check(view_config, drawn_sun=True)
     rng = np.random.default_rng(stereo.seed)
     pairs: list[dict[str, Any]] = []
@@ -48,7 +48,7 @@ def render_stereo(source: Path, folder: Path, config: Config, stereo: StereoConf
         places = _Places(renderer.surface, config, stereo, rng)
         for number, name in enumerate(names):
             progress(number, stereo.count, "pairs")
-            pairs.append(_render_pair(name, renderer, places, view_config, world, folder))
+            pairs.append(_render_pair(name, renderer, places, config.rig, view_config, world, folder))
         document = {
             "source": source.name,
             "pixel_centre": 0.5,
@@ -66,6 +66,7 @@ def render_stereo(source: Path, folder: Path, config: Config, stereo: StereoConf
 def _check(config: Config, stereo: StereoConfig) -> None:
     if stereo.count < 1:
         raise ConfigError(f"`stereo`: expected at least 1 pair, found {stereo.count}.")
+    check_rig(config)
     low, high = stereo.convergence_deg
     if not 0 < low <= high <= 90:
         raise ConfigError(f"`convergence`: expected LOW,HIGH degrees in 0..90, found {low:g},{high:g}.")
@@ -95,6 +96,11 @@ class _Places:
         self.splits = _split_tiles(len(self.corners), rng)
         self.drawn = 0
 
+    def next_sun(self) -> dict[str, float]:
+        """Settings of a Sun."""
+        azimuth, elevation = self.rng.uniform(0, 360), self.rng.uniform(*self.stereo.sun_elevation_deg)
+        return {"sun_azimuth_deg": azimuth, "sun_elevation_deg": elevation}
+
     def next(self) -> tuple[str, int, Floats]:
         """Split, number of the tile and a place on the ground, (3,) body-fixed, m. Raises GeometryError."""
         grid, px = self.surface.grid, self.tile / self.surface.grid.gsd
@@ -120,30 +126,19 @@ def _split_tiles(count: int, rng: np.random.Generator) -> list[str]:
 
 
 def _render_pair(
-    name: str, renderer: Renderer, places: _Places, config: Config, world: World, folder: Path
+    name: str, renderer: Renderer, places: _Places, rig: float | None, config: Config, world: World, folder: Path
 ) -> dict[str, Any]:
     """Both pictures, the correspondences, and the pair's entry in the manifest."""
     split, tile, target = places.next()
-    stereo, rng = places.stereo, places.rng
-    convergence = rng.uniform(*stereo.convergence_deg)
-    sights = _lines_of_sight(target, convergence, stereo.off_nadir_deg, rng)
-    views, exrs, cameras = [], [], []
-    for side, sight in zip(("left", "right"), sights, strict=True):
-        position = target + sight * places.altitude
-        roll = rng.uniform(-stereo.roll_deg, stereo.roll_deg)
-        camera = pinhole_view(
-            position, look_at(position, target, roll), config.fov_deg, config.size_px, renderer.surface.grid.radius
-        )
-        sun: dict[str, Any] = {
-            "sun_azimuth_deg": rng.uniform(0, 360),
-            "sun_elevation_deg": rng.uniform(*stereo.sun_elevation_deg),
-        }
+    convergence, cameras = _draw_cameras(target, places, rig, config)
+    suns = [places.next_sun(), places.next_sun()] if rig is None else [places.next_sun()] * 2
+    views, exrs = [], []
+    for side, camera, sun in zip(SIDES, cameras, suns, strict=True):
         view_config = replace(config, **sun)
         files = view_files(folder, f"{name}_{side}", config)
         render_camera(renderer, camera, files, view_config, f"{name}_{side}", show_nothing)
         views.append({"image": files[0].name, "preview": files[1].name, "camera": camera.to_document(), **sun})
         exrs.append(read_exr(files[0]))
-        cameras.append(camera)
     depths = exrs[0]["depth"], exrs[1]["depth"]
     matches = correspondences(cameras[0], cameras[1], depths, world)
     path = pair_files(folder, name, config)[-1]
@@ -162,6 +157,25 @@ def _render_pair(
         "right": views[1],
         "matches": path.name,
     }
+
+
+def _draw_cameras(target: Floats, places: _Places, rig: float | None, config: Config) -> tuple[float, list[Pinhole]]:
+    """The angle between both lines of sight at the ground, deg, and both cameras: converging, or parallel on a rig."""
+    stereo, rng = places.stereo, places.rng
+    if rig is None:
+        convergence = rng.uniform(*stereo.convergence_deg)
+    else:
+        convergence = 2 * math.degrees(math.atan(rig / 2 / places.altitude))
+    cameras = []
+    for sight in _lines_of_sight(target, convergence if rig is None else 0.0, stereo.off_nadir_deg, rng):
+        position = target + sight * places.altitude
+        roll = rng.uniform(-stereo.roll_deg, stereo.roll_deg)
+        rotation = look_at(position, target, roll)
+        cameras.append(pinhole_view(position, rotation, config.fov_deg, config.size_px, places.surface.grid.radius))
+    if rig is not None:
+        aside = 0.5 * rig * cameras[0].rotation[:, 0]
+        cameras = [replace(cameras[0], centre=cameras[0].centre + way * aside) for way in (-1, 1)]
+    return convergence, cameras
 
 
 def _lines_of_sight(
