@@ -297,7 +297,7 @@ $(A)/match.json: $(A)/pairs.h5 $(A)/checkpoint_0.h5
 
 $(A)/diagnosis.h5: $(A)/scene.h5
 	$(LUNARGR) sample $< --stack --count 24 --tile-m 32000 --split 70/10/20 -o $(A)/stack_crops.h5 --overwrite
-	$(LUNARGR) project $(A)/stack_crops.h5 -o $(A)/stack.h5 --overwrite
+	$(LUNARGR) project $(A)/stack_crops.h5 --exact -o $(A)/stack.h5 --overwrite
 	$(LUNARGR) diagnose $(A)/stack.h5 --model hapke -o $@ --json $(A)/diagnosis.json --report $(A)/diagnosis.html --overwrite
 
 $(A)/report.html: $(A)/evaluation.h5 $(A)/held_out.h5 $(A)/match.json $(A)/render.exr $(A)/diagnosis.h5

@@ -136,8 +136,8 @@ def prepare_stacks(folder: Path) -> None:
     steps = {
         scene: f"ingest {dem} --images {table} --gsd 474 --crop 48",
         crops: f"sample {scene} --stack --count 24 --tile-m 32000 --split 70/10/20",
-        folder / "raw.h5": f"project {crops}",
-        folder / "registered.h5": f"project {crops} --register field",
+        folder / "raw.h5": f"project {crops} --exact",
+        folder / "registered.h5": f"project {crops} --exact --register field",
     }
     for made, step in steps.items():
         if not made.exists():

@@ -107,20 +107,62 @@ def match(
     return out
 
 
-def asked(chain: Chain, lit: Tensor, known: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def asked(
+    chain: Chain, lit: Tensor, known: tuple[Tensor, Tensor], albedo: bool = False
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Of images that are displaced by about ``known``, four (n, H, W): the residual, what a px further east and south adds to it, and the
     inverse of its variance where it counts. What is broad is left out, and images that show little of the rendered contrast do not count.
+
+    albedo : whether what the other images show is left in
     """
     rendered, site = chain.predict(), chain.site
     image, valid = aligned(site.read, site.read_valid, *known, displace)  # only linearised about: a quick one does
     mask = (valid & lit).float()
+    image = image if albedo else without_albedo(image, rendered, mask)
     measured, predicted, *slopes = fine(torch.stack([image, rendered, *gradients(rendered)]), mask, BROAD)
-    scale = ((measured * predicted).sum((-2, -1)) / predicted.square().sum((-2, -1)).clamp(min=1e-20)).clamp(min=0)
+    scale = _scale(measured, predicted)
     residual = measured - scale[:, None, None] * predicted
     east, south = (g * scale[:, None, None] for g in slopes)
     variance = residual.square().sum((-2, -1)) / mask.sum((-2, -1)).clamp(min=1)
     told = (scale > CONTRAST * site.gain.abs()) / variance.clamp(min=1e-20)
     return residual, east, south, mask * told[:, None, None]
+
+
+def _scale(measured: Tensor, predicted: Tensor) -> Tensor:
+    """(n,) by least squares; brighter is brighter."""
+    return ((measured * predicted).sum((-2, -1)) / predicted.square().sum((-2, -1)).clamp(min=1e-20)).clamp(min=0)
+
+
+def without_albedo(image: Tensor, rendered: Tensor, mask: Tensor) -> Tensor:
+    """(n, H, W) images of a place without the fine albedo that each other one shows; mask : 1 where an image counts."""
+    measured, predicted = fine(torch.stack([image, rendered]), mask, BROAD)
+    level = ((image * mask).sum((-2, -1)) / mask.sum((-2, -1)).clamp(min=1)).abs().clamp(min=1e-9)[:, None, None]
+    return image - level * of_others((measured - _scale(measured, predicted)[:, None, None] * predicted) / level, mask)
+
+
+def of_others(relative: Tensor, mask: Tensor) -> Tensor:
+    """(n, H, W) what the other images of a place tell of the relative residual (n, H, W) of each: its albedo.
+
+    Where albedo goes with relief (bright rims and floors of craters), it looks like a shift of every image towards its Sun. Best linear
+    prediction from the others' mean; mask : (n, H, W) 1 where an image counts.
+    """
+    variance = (relative.square() * mask).sum((-2, -1)) / mask.sum((-2, -1)).clamp(min=1)
+    mean, known = _of_rest(relative, mask / variance.clamp(min=1e-20)[:, None, None])
+    seen = mask * (known > 0)
+    common = float((seen * relative * mean).sum() / seen.sum().clamp(min=1))  # variance of albedo
+    if not common > 0:
+        return torch.zeros_like(relative)
+    own = (variance - common).clamp(min=0.05 * variance, max=variance).clamp(min=1e-20)
+    mean, known = _of_rest(relative, mask / own[:, None, None])
+    return mask * mean * common * known / (common * known + 1)
+
+
+def _of_rest(relative: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Of every image the weighted mean of all others, 0 where there is none, and the sum of their weights, (n, H, W) each."""
+    known = weight.sum(0) - weight
+    known = torch.where(known > 1e-6 * weight.sum(0), known, 0.0)
+    total = (relative * weight).sum(0) - relative * weight
+    return torch.where(known > 0, total / known.clamp(min=1e-20), 0.0), known
 
 
 def _parts(height: int, width: int, pieces: int) -> list[tuple[slice, slice]]:

@@ -160,7 +160,7 @@ def _equations(chain: Chain, field: Field, known: Field, waves: Tensor, first: T
     """Products (2, n, P, P) and (2, n, P) of either half of the samples, P = 2 + 2 K: a shift, and waves beside ``known``, east and south;
     linearised at ``field``.
     """
-    residual, east, south, weight = asked(chain, full_light(chain), field)
+    residual, east, south, weight = asked(chain, full_light(chain), field, albedo=True)
     target = residual + east * (field[0] - known[0]) + south * (field[1] - known[1])
     slopes = torch.stack([east, south], 1)
     columns = torch.cat([slopes, *(slope[:, None] * waves for slope in (east, south))], 1).flatten(2)

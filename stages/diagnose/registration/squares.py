@@ -16,7 +16,7 @@ from stages.diagnose.data.sites import Site
 from stages.diagnose.likelihood.intervals import folds
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.nominal import full_light
-from stages.diagnose.registration.forms import FORMS, Matched, displacement, solve
+from stages.diagnose.registration.forms import FORMS, Matched, displacement, of_others, solve
 from stages.diagnose.registration.start import Field
 
 OWN = "own", "own, leaning"  # each image's own shift, without and with relief displacement
@@ -62,12 +62,13 @@ def compared(
 
 def left(parts: Sequence[Matched], fields: Sequence[Field]) -> list[list[NDArray[np.float64]]]:
     """Of every field, for every part of one site: (n,) sums of squared relative residuals on the pixels that all fields keep, gain and offset
-    per image and part taken out.
+    per image and part taken out, and what the other images show as well.
     """
     chain = parts[0].chain
     predicted, lit = chain.predict(), full_light(chain)
     moved = [aligned(chain.site.read, chain.site.read_valid, *f) for f in fields]
     kept = lit & torch.stack([v for _, v in moved]).all(0)
+    level = _brightness(chain)[:, None, None]
 
     def of(image: Tensor, m: Matched) -> NDArray[np.float64]:
         rows, columns = m.here
@@ -80,16 +81,16 @@ def left(parts: Sequence[Matched], fields: Sequence[Field]) -> list[list[NDArray
 
         x, y = varied(predicted), varied(image)
         slope = (x * y).sum((-2, -1), keepdim=True) / x.square().sum((-2, -1), keepdim=True).clamp(min=1e-20)
-        rest = y - slope.clamp(min=0) * x  # brighter is brighter
-        return (rest.square().sum((-2, -1)) / _norm(chain)).numpy()
+        rest = (y - slope.clamp(min=0) * x) / level  # brighter is brighter
+        return (rest - of_others(rest, weight)).square().sum((-2, -1)).numpy()
 
     return [[of(image, m) for m in parts] for image, _ in moved]
 
 
-def _norm(chain: Chain) -> Tensor:
-    """(n,) squared brightness as measured, so that images of all exposures count alike."""
+def _brightness(chain: Chain) -> Tensor:
+    """(n,) means as measured, so that images of all exposures count alike."""
     mask = chain.site.read_valid.double()
-    return ((chain.site.read * mask).sum((-2, -1)) / mask.sum((-2, -1)).clamp(min=1)).square().clamp(min=1e-20)
+    return ((chain.site.read * mask).sum((-2, -1)) / mask.sum((-2, -1)).clamp(min=1)).abs().clamp(min=1e-10)
 
 
 def grounds(matched: Sequence[Matched], once: bool) -> list[int]:

@@ -14,6 +14,7 @@ from stages.diagnose.data.sites import Site
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.nominal import lit_mask
 from stages.diagnose.registration.capture import contrast, correlations, peak
+from stages.diagnose.registration.forms import without_albedo
 from stages.diagnose.settings import BROAD, CAPTURE, CONTRAST, CORRELATED, SURE
 from stages.effects.relief_displacement import lean
 from stages.physics.formation.resampling import displace
@@ -60,7 +61,7 @@ def captured(chains: Sequence[Chain]) -> list[Tensor]:
 
     def of(chain: Chain) -> tuple[Tensor, Tensor, Tensor]:
         site, rendered, lit = chain.site, chain.predict(), _lit(chain)
-        every = correlations(site.read, site.read_valid, rendered, lit, CAPTURE, BROAD)
+        every = correlations(_told(chain), site.read_valid, rendered, lit, CAPTURE, BROAD)
         shift, highest = peak(every)
         near = slice(CAPTURE - 1, CAPTURE + 2)
         still = every[:, near, near].flatten(1).amax(1)
@@ -85,7 +86,7 @@ def _frame_shifts(chains: Sequence[Chain], frames: int) -> tuple[Tensor, float]:
 
     def of(chain: Chain) -> tuple[Tensor, Tensor, Tensor]:
         site, rendered, lit = chain.site, chain.predict(), _lit(chain)
-        r = correlations(site.read, site.read_valid, rendered, lit, CAPTURE, BROAD).clamp(0, 0.999)
+        r = correlations(_told(chain), site.read_valid, rendered, lit, CAPTURE, BROAD).clamp(0, 0.999)
         count = ((site.read_valid & lit).sum((-2, -1)) / CORRELATED)[:, None, None]
         shown = r * _relative_contrast(site, rendered, lit)[:, None, None]
         return -0.5 * count * torch.log1p(-r.square()), count * shown, count
@@ -101,6 +102,11 @@ def _frame_shifts(chains: Sequence[Chain], frames: int) -> tuple[Tensor, float]:
     there = shown.flatten(1).gather(1, likelihood.flatten(1).argmax(1, keepdim=True))[:, 0]
     sure = (best > still + SURE**2 / 2) & (there > CONTRAST * count[:, 0, 0])
     return torch.where(sure[:, None], shifts, 0.0), float(torch.where(sure, best, still).sum())
+
+
+def _told(chain: Chain) -> Tensor:
+    """(n, H, W) the images without albedo, which looks like a shift where it goes with relief."""
+    return without_albedo(chain.site.read, chain.predict(), (chain.site.read_valid & _lit(chain)).float())
 
 
 def _lit(chain: Chain) -> Tensor:

@@ -210,10 +210,15 @@ def take(state: State, view: View, cause: Cause) -> Refusal | None:
     start_nearer(state, view, cause)
     while True:
         look = refine(state, view)
-        errors_over_images(state, look)
         secant_gains(state, cause, look)
         refusal = state.decide(cause)
-        spoilt = [c for c in state.named if c is not cause and state.decide(c, sure=True)]
+        spoilt: list[Cause] = []
+        if (
+            refusal is None or refusal.reason is Reason.ORDINARY
+        ):  # nothing but its scatter over images can refuse it now
+            errors_over_images(state, look)
+            refusal = state.decide(cause)
+            spoilt = [c for c in state.named if c is not cause and state.decide(c, sure=True)]
         # values per image, which can mimic one value for all, drive none out
         if refusal or not spoilt or cause.found.guise.per_frame or not cause.effect.listed:
             break
