@@ -80,7 +80,7 @@ def _as_typed(name: str, command: Callable[..., None]) -> Callable[..., None]:
 app = typer.Typer(
     name="lunargr",
     help="Learn the reflectance of the Moon from terrain and images, and find what a simulation of them gets wrong.\n\n"
-    "simulate -> ingest -> sample -> project -> train -> infer -> albedo -> render / view -> evaluate / match, and diagnose",
+    "simulate -> ingest -> sample -> project -> train -> infer -> albedo -> refine -> render / view -> evaluate / match, and diagnose",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,

@@ -105,6 +105,7 @@ STEPS: dict[str, Callable[[Options], str]] = {
     "train": _train,
     "infer": _after("view", "view.html"),
     "albedo": _albedo,
+    "refine": _after("view", "view.html"),
     "normalize": lambda o: _run("inspect", o["output"]),
     "render": _render,
     "view": lambda o: _open(o["output"]),

@@ -16,9 +16,8 @@ from scipy.ndimage import shift
 from schemas import ArtefactError, ConfigError, InputError
 from schemas.files.outputs import Output
 from stages import albedo, merge
-from stages.albedo import stage as running
-from stages.albedo.posterior import Spread, estimate, robust_mean
-from stages.albedo.pyramid import LEVELS
+from stages.photographs.posterior import Spread, estimate, robust_mean
+from stages.photographs.pyramid import LEVELS
 
 QUIET = albedo.Config(geotiff=False)
 
@@ -352,14 +351,16 @@ def test_noisy_images_weigh_less():
 
 def test_what_registration_finds_is_taken_off_by_all_shards(rng, tmp_path, monkeypatch):
     """Images three pixels aside: where that is told, the albedo is as sharp as if they were not, whoever reads them."""
-    from stages.albedo.calibrate import Calibration
+    from stages.photographs.calibrate import Calibration, read_calibration, write_calibration
     from stages.physics.images.displacement import Basis, Field
 
     truth = np.exp(texture(rng))
     images = [shift(image, (0, 3), mode="nearest") for image in photographs(rng, truth)]
     scene = plant(tmp_path, truth, images)
     aside = Field(Basis("constant", (0.0, 0.0)), np.array([[3.0], [0.0]]), 16, 16, 0.1, 0.1, 0.9)
-    monkeypatch.setattr(running, "register", lambda references, form, progress: [aside] * len(references.frames))
+    monkeypatch.setattr(
+        "stages.photographs.ground.register", lambda references, form, progress: [aside] * len(references.frames)
+    )
     config = replace(QUIET, register="constant")
     inner = np.s_[8:-8, 8:-8]
     whole = made(scene, config)[0]
@@ -369,9 +370,10 @@ def test_what_registration_finds_is_taken_off_by_all_shards(rng, tmp_path, monke
     path, again, part = (tmp_path / name for name in ("calibration.json", "again.json", "part.h5"))
     albedo.calibrate_to(scene.map, scene.scene, path, config)
     made_from = json.loads(path.read_text())["made_from"]
-    Calibration.read(path, made_from).write(again, made_from)
+    kept = Calibration.from_text(read_calibration(path, made_from, "albedo"))
+    write_calibration(again, kept.as_text(), made_from)
     assert again.read_bytes() == path.read_bytes()
-    monkeypatch.setattr(running, "_calibrate", None)  # shards have no need of it
+    monkeypatch.setattr("stages.photographs.ground.Ground.calibrate", None)  # shards have no need of it
     albedo.run(scene.map, scene.scene, path, part, config)
     np.testing.assert_array_equal(read(part, "albedo")[0], whole)
     with pytest.raises(ArtefactError, match=r"calibration\.json: .* found another \(register\)"):

@@ -17,6 +17,7 @@ STAGES = [
     "train",
     "infer",
     "albedo",
+    "refine",
     "normalize",
     "render",
     "evaluate",

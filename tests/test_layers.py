@@ -1,4 +1,4 @@
-"""Imports run one way: schemas <- common <- physics <- pairs <- network, effects, merge <- stages <- pipelines <- command line; stages never
+"""Imports run one way: schemas <- common <- physics <- pairs <- network, effects, merge, photographs <- stages <- pipelines <- command line; stages never
 import each other."""
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ LAYERS = [
     "stages.common",
     "stages.physics",
     "stages.pairs",
-    "stages.network|stages.effects|stages.merge",
+    "stages.network|stages.effects|stages.merge|stages.photographs",
     "stages",
     "stages.pipelines",
     "lunargr_cli",

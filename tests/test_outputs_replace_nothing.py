@@ -42,6 +42,7 @@ READS = {
     "inspect": (["scene.h5", "image1.tif"], ["scene.h5"]),
     "models": ([], []),
     "albedo": (["svbrdf.h5", "scene.h5", "image1.tif", "dem.tif"], ["svbrdf.h5", "scene.h5"]),
+    "refine": (["svbrdf.h5", "scene.h5", "image1.tif", "dem.tif"], ["svbrdf.h5", "scene.h5"]),
     "normalize": (["scene.h5", "svbrdf.h5", "image1.tif", "dem.tif"], ["scene.h5", "svbrdf.h5"]),
     "view": (["svbrdf.h5", "pairs.h5"], ["svbrdf.h5", "--pairs", "pairs.h5"]),
     "export": (["checkpoint.h5"], ["checkpoint.h5"]),

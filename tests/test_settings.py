@@ -24,7 +24,7 @@ MODULES = {
 CONFIGS = {
     "albedo": "albedo", "compare": "train", "convert": "convert", "diagnose": "diagnose", "evaluate": "evaluate",
     "export": "export", "infer": "infer", "ingest": "ingest", "match": "match", "merge": "merge", "project": "project",
-    "render": "render", "report": "report", "sample": "sample", "train": "train", "view": "view",
+    "refine": "refine", "render": "render", "report": "report", "sample": "sample", "train": "train", "view": "view",
 }  # fmt: skip
 # How commands write what a Config holds as a tuple.
 WRITTEN = {
@@ -34,7 +34,7 @@ WRITTEN = {
 }  # fmt: skip
 # Of the same name, but not the setting: where the GeoTIFF goes, not whether; left away for the stage's own choice.
 OTHERS = {
-    ("infer", "geotiff"), ("albedo", "geotiff"), ("match", "matchers"),
+    ("infer", "geotiff"), ("albedo", "geotiff"), ("refine", "geotiff"), ("match", "matchers"),
     *(("render", name) for name in ("view", "roll_deg", "fov_deg", "size_px")),
 }  # fmt: skip
 # What commands have beside settings.

@@ -54,6 +54,25 @@ _ALBEDO = (
     _albedo_column("level", "albedo_interval_shadow", "1", _SHADOW),
 )
 
+
+def _refined_column(dim: str, name: str, unit: str, description: str) -> Variable:
+    return column(dim, name, unit, description, required=False)
+
+
+_WAVE = "orthonormal cosine waves of about this length"
+_REFINED = (
+    grid_map("elevation_correction", "f4", "m", "what photographs added to the DEM's elevation", required=False),
+    grid_map("elevation_std", "f4", "m", "standard deviation of the corrected elevation's waves", required=False),
+    _albedo_map("albedo_alone", "f4", "albedo before the elevation was corrected"),
+    _refined_column("wavelength", "refine_wavelength_px", "px", "wavelengths, broad to fine"),
+    _refined_column("wavelength", "refine_elevation_wave_std", "m", f"std of what the DEM lacks, {_WAVE}"),
+    _refined_column("wavelength", "refine_albedo_wave_std", "1", f"std of log albedo, {_WAVE}"),
+    _refined_column("wavelength", "refine_trust", "1", "share of white noise's weight that images keep"),
+    _refined_column(
+        "bound", "refine_gain_percent", "percent", "by which squared errors of images left out fall; value, low, high"
+    ),
+)
+
 SVBRDF = declare(
     Schema(
         name="svbrdf",
@@ -69,6 +88,8 @@ SVBRDF = declare(
             "band": "structure sizes, fine to coarse",
             "incidence_bin": "bins of the cosine of incidence",
             "level": "68 and 95 % intervals",
+            "wavelength": "wavelengths of spectra, broad to fine",
+            "bound": "value and both ends of its 95 % interval",
             "place": LEARNED,
         },
         variables=GRID
@@ -95,6 +116,7 @@ SVBRDF = declare(
             grid_map("valid", "u1", "1", "1 = the map holds coefficients here", flags=VALIDITY, compress=True),
         )
         + _ALBEDO
+        + _REFINED
         + LEARNED_GROUND,
         attributes=PLACE
         + (
@@ -102,6 +124,7 @@ SVBRDF = declare(
             Attribute("quantity", "what the model gives: I/F"),
             IMAGE_NOISE,
             LEARNED_EDGE,
+            Attribute("refine_reason", "why refine left the elevation as it was, or empty", required=False),
             Attribute("image_units", "units of the images that the map was trained on: 'iof' or 'dn'", required=False),
         ),
     )

@@ -14,7 +14,7 @@ from stages.common import runner
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
 
 if TYPE_CHECKING:
-    from stages.albedo.calibrate import Calibration
+    from stages.photographs.calibrate import Calibration
 
 __all__ = ["Config", "Summary", "calibrate_to", "run"]
 

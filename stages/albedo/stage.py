@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -17,76 +16,53 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas import SCENE, SVBRDF, ArtefactError, ArtefactWriter, InputError, atomic_path, open_artefact
+from schemas import SCENE, SVBRDF, ArtefactError, ArtefactWriter, atomic_path, open_artefact
 from schemas.files.outputs import Output
 from schemas.provenance import sha256
 from schemas.reading import read_config, read_strings
 from stages import merge
 from stages.albedo import calibrate_to
-from stages.albedo.calibrate import COSINES, Calibration, calibrate, take_samples
 from stages.albedo.config import Config, Summary, used_frames
-from stages.albedo.posterior import estimate, robust_mean
-from stages.albedo.prior import terrain_variance
-from stages.albedo.pyramid import HALO_PX, LEVELS
-from stages.albedo.writing import Maps, copy_map, kept_attributes
+from stages.albedo.writing import Maps
 from stages.common.arrays import Floats32
 from stages.common.progress import Progress
 from stages.common.runner.job import Job
 from stages.common.runner.stage import as_geotiff
-from stages.physics.bodies.spheres import find_body
-from stages.physics.images.references import References, open_references
-from stages.physics.images.registered import register
-from stages.physics.images.table import Frame, load_frames
-from stages.physics.images.windows import Blocks, choose_blocks, choose_windows
+from stages.photographs.calibrate import COSINES, Calibration, read_calibration, write_calibration
+from stages.photographs.copying import copy_map, kept_attributes, sizes_of
+from stages.photographs.ground import Ground, open_ground
+from stages.photographs.posterior import estimate, robust_mean
+from stages.photographs.prior import terrain_variance
+from stages.photographs.pyramid import HALO_PX, LEVELS
 from stages.physics.maps.geotiff import write_geotiff
-from stages.physics.maps.grid import check_same_grid, read_grid
+from stages.physics.maps.grid import read_grid
 from stages.physics.maps.window import Box
-from stages.physics.terrain.surface import Surface, open_surface
 
 
-@dataclass(frozen=True)
-class Ground:
-    """A map, the scene's photographs of it, and whether they are in I/F."""
-
-    map: h5py.File
-    references: References
-    units: str
-    surface: Surface
-
-
-@contextlib.contextmanager
-def open_ground(svbrdf: Path, scene: Path, config: Config) -> Iterator[Ground]:
+def open_map(svbrdf: Path, scene: Path, config: Config) -> contextlib.AbstractContextManager[Ground]:
     """A map without albedo and the photographs that may enter. Raises LunargrError."""
-    with contextlib.ExitStack() as stack:
-        file = stack.enter_context(open_artefact(svbrdf, SVBRDF))
+
+    def check(file: h5py.File) -> None:
         if "albedo" in file:
             raise ArtefactError(
                 f"{svbrdf}:/albedo: expected a map without albedo, found one that photographs were applied to already; "
                 "start from the output of 'lunargr infer'."
             )
-        terrain = stack.enter_context(open_artefact(scene, SCENE))
-        check_same_grid(svbrdf, file, scene, terrain)
-        frames = load_frames(terrain, scene)
-        used = used_frames(frames, config) if frames else []
-        surface = stack.enter_context(open_surface(svbrdf, None, {}, find_body(str(file.attrs["body_radius_m"]))))
-        shown = replace(surface, deviations=None)
-        references = stack.enter_context(open_references(scene, terrain, shown, used))
-        yield Ground(file, references, _units(svbrdf, file, scene, references.frames), surface)
+
+    return open_ground(svbrdf, scene, check, lambda frames, file: used_frames(frames, config))
 
 
 def work(
     svbrdf: Path, scene: Path, calibration: Path | None, output: Output, config: Config, progress: Progress
 ) -> Summary:
     """See :func:`stages.albedo.run`."""
-    with open_ground(svbrdf, scene, config) as ground:
+    with open_map(svbrdf, scene, config) as ground:
         if calibration:
-            found = Calibration.read(calibration, _identity(svbrdf, scene, config))
+            found = Calibration.from_text(read_calibration(calibration, _identity(svbrdf, scene, config), "albedo"))
         else:
-            found = _calibrate(svbrdf, scene, ground, config, progress)
+            found = ground.calibrate(config.register, progress)
         ground.references.subtract_displacement(found.fields)
-        there = [v for v in SVBRDF.variables if v.name in ground.map]
-        sizes = {dim: n for v in there for dim, n in zip(v.dims, ground.map[v.name].shape, strict=True)}
-        sizes |= {
+        sizes = sizes_of(ground.map) | {
             "frame": len(ground.references.frames),
             "band": LEVELS + 1,
             "incidence_bin": len(COSINES) - 1,
@@ -100,7 +76,7 @@ def work(
             inputs=[svbrdf, scene],
             attributes=kept_attributes(ground.map),
         ) as writer:
-            blocks = _blocks(ground)
+            blocks = ground.blocks(HALO_PX)
             own = blocks.own_rows(config.shard)
             if config.shard[1] > 1:
                 writer.file.attrs["shard_rows"] = np.array(own, np.int64)
@@ -117,7 +93,7 @@ def work(
 def in_parts(job: Job, svbrdf: Path, scene: Path, _: None, config: Config) -> Summary:
     """The map: the images' calibration in one part, then shards of the map's rows."""
     files = {"svbrdf": svbrdf, "scene": scene, "config": config}
-    [calibration] = job.fan("calibration", write_calibration, [files], ".json")
+    [calibration] = job.fan("calibration", write_part, [files], ".json")
     bands = _count_bands(svbrdf, scene, config)
     pieces = job.shards("map", [svbrdf, scene, calibration], config, bands)
     whole = Output(job.output.file, overwrite=True, geotiff=job.output.geotiff)
@@ -125,16 +101,16 @@ def in_parts(job: Job, svbrdf: Path, scene: Path, _: None, config: Config) -> Su
     return _summarise(job.output.file, scene)
 
 
-def write_calibration(path: Path, svbrdf: Path, scene: Path, config: Config) -> None:
+def write_part(path: Path, svbrdf: Path, scene: Path, config: Config) -> None:
     """The calibration as a part."""
     calibrate_to(svbrdf, scene, Output(path, overwrite=True), config)
 
 
 def calibrate_images(svbrdf: Path, scene: Path, output: Output, config: Config, progress: Progress) -> Calibration:
     """See :func:`stages.albedo.calibrate_to`."""
-    with open_ground(svbrdf, scene, config) as ground, atomic_path(output.file) as partial:
-        found = _calibrate(svbrdf, scene, ground, config, progress)
-        found.write(partial, _identity(svbrdf, scene, config))
+    with open_map(svbrdf, scene, config) as ground, atomic_path(output.file) as partial:
+        found = ground.calibrate(config.register, progress)
+        write_calibration(partial, found.as_text(), _identity(svbrdf, scene, config))
     return found
 
 
@@ -143,19 +119,6 @@ def _identity(svbrdf: Path, scene: Path, config: Config) -> dict[str, Any]:
     fold = list(config.fold) if config.fold else None
     options = {"leave_out": list(config.leave_out), "fold": fold, "register": config.register}
     return {"svbrdf": sha256(svbrdf), "scene": sha256(scene)} | options
-
-
-def _calibrate(svbrdf: Path, scene: Path, ground: Ground, config: Config, progress: Progress) -> Calibration:
-    references = ground.references
-    fields = tuple(register(references, config.register, progress)) if config.register else ()
-    references.subtract_displacement(fields)
-    windows = choose_windows(ground.map["valid"].shape, len(references.frames), references.overlapping)
-    samples = take_samples(references, windows, progress, lambda box: terrain_variance(ground.surface, box))
-    if not samples:
-        raise InputError(
-            f"{scene}: expected images that overlap the map {svbrdf}, found none whose sunlit pixels lie on valid ground."
-        )
-    return replace(calibrate(samples, len(references.frames), ground.units), fields=fields)
 
 
 def work_block(ground: Ground, calibration: Calibration, block: Box) -> tuple[Floats32, Floats32, NDArray[np.uint16]]:
@@ -187,12 +150,8 @@ def work_block(ground: Ground, calibration: Calibration, block: Box) -> tuple[Fl
 
 def _count_bands(svbrdf: Path, scene: Path, config: Config) -> int:
     """Rows of blocks on a map: more shards than these have nothing to do."""
-    with open_ground(svbrdf, scene, config) as ground:
-        return _blocks(ground).bands
-
-
-def _blocks(ground: Ground) -> Blocks:
-    return choose_blocks(ground.map["valid"].shape, ground.references.overlapping, HALO_PX)
+    with open_map(svbrdf, scene, config) as ground:
+        return ground.blocks(HALO_PX).bands
 
 
 def _summarise(output: Path, scene: Path) -> Summary:
@@ -202,19 +161,6 @@ def _summarise(output: Path, scene: Path) -> Summary:
         fold = told.get("fold")
         config = Config(tuple(told.get("leave_out", ())), tuple(fold) if fold else None)
         return _summary(file, config, scene)
-
-
-def _units(svbrdf: Path, file: h5py.File, scene: Path, frames: Sequence[Frame]) -> str:
-    units = {frame.units for frame in frames}
-    if len(units) > 1:
-        raise InputError(f"{scene}: expected one kind of units, found both 'iof' and 'dn'; ingest them apart.")
-    found = units.pop()
-    if found == "iof" and str(file.attrs.get("image_units", "iof")) == "dn":
-        raise InputError(
-            f"{scene}: expected images in DN as those that {svbrdf} was trained on, found I/F; its brightness scale is "
-            "arbitrary. Train on images in I/F."
-        )
-    return found
 
 
 def _summary(file: h5py.File, config: Config, scene: Path) -> Summary:

@@ -3,48 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas import SVBRDF, ArtefactWriter
-from schemas.reading import read_strings
-from stages.albedo.calibrate import COSINES, Calibration
-from stages.albedo.pyramid import LEVELS
+from schemas import ArtefactWriter
+from stages.photographs.calibrate import COSINES, Calibration
+from stages.photographs.pyramid import LEVELS
 from stages.physics.images.table import Frame
 from stages.physics.maps.window import Box
-
-ROWS = 256  # rows that are copied at a time
-
-# Root attributes that every artefact makes for itself.
-_OWN = (
-    "Conventions", "title", "lunargr_schema", "schema_version", "lunargr_version", "history", "config", "inputs", "seed",
-    "command", "folder", "provenance", "parts", "shard_rows",
-)  # fmt: skip
-
-
-def kept_attributes(source: h5py.File) -> dict[str, Any]:
-    """What the new map says of itself as the old one did."""
-    return {key: value for key, value in source.attrs.items() if key not in _OWN}
-
-
-def copy_map(source: h5py.File, writer: ArtefactWriter, rows: tuple[int, int]) -> None:
-    """Every variable of a map but its rows outside of ``rows``."""
-    if "crs" in source:
-        source.copy("crs", writer.file, "crs")
-    for variable in SVBRDF.variables:
-        if variable.name not in source:
-            continue
-        if variable.dims[-2:] != ("y", "x"):
-            named = variable.dtype == "string"
-            writer.write(variable.name, read_strings(source, variable.name) if named else source[variable.name][...])
-            continue
-        target = writer.dataset(variable.name)
-        for row in range(rows[0], rows[1], ROWS):
-            part = (..., slice(row, min(rows[1], row + ROWS)), slice(None))
-            target[part] = source[variable.name][part]
 
 
 class Maps:

@@ -10,7 +10,7 @@ import contextlib
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +48,7 @@ from stages.physics.photometry import get_model
 from stages.physics.terrain.surface import SHADOWED, AlbedoError
 
 CLAIM = "seen ground, unseen images"
-ROWS = ("terrain", "albedo", "terrain_gain_offset", "albedo_gain_offset")
+MAPS = ("terrain", "albedo", "refined")  # each with all that the one before has; the last where the maps were refined
 SAME_GROUND = 0.01  # of the pairs' gsd: heights of the same pixel in map and pairs differ by rounding only
 FIT_PAIRS = 64  # pairs of one image that its gain and offset are fitted on, where it is in DN
 
@@ -63,13 +63,25 @@ class AlbedoMap:
     suns: Floats
     error: AlbedoError
 
+    @property
+    def refined(self) -> bool:
+        """Whether `lunargr refine` corrected its elevations."""
+        return "elevation_correction" in self.file
+
     def render(self, reader: PairReader, k: int) -> list[torch.Tensor]:
-        """I/F of pair ``k`` without and with albedo, (1, h, w) each, NaN where unknown."""
-        part = _part(reader, k)
-        coefficients = torch.from_numpy(self.file["coefficients"][:, *part])[None]
+        """I/F of pair ``k``, (1, h, w) for each of MAPS that there are, NaN where unknown; shadows are the pair's."""
+        part, file = _part(reader, k), self.file
+        coefficients = torch.from_numpy(file["coefficients"][:, *part])[None]
+        observation, model = reader.observation([k]), get_model(str(file.attrs["model"]))
         with torch.no_grad():
-            terrain = form(reader.observation([k]), get_model(str(self.file.attrs["model"])), coefficients).double()
-        return [terrain, terrain * torch.from_numpy(self.file["albedo"][part])[None]]
+            terrain = form(observation, model, coefficients).double()
+            albedo = torch.from_numpy(file["albedo"][part])[None]
+            if not self.refined:
+                return [terrain, terrain * albedo]
+            alone = torch.from_numpy(file["albedo_alone"][part])[None]
+            correction = torch.from_numpy(np.nan_to_num(file["elevation_correction"][part]))[None]
+            raised = form(replace(observation, elevation=observation.elevation + correction), model, coefficients)
+            return [terrain, terrain * alone, raised.double() * albedo]
 
 
 def _part(reader: PairReader, k: int) -> tuple[slice, slice]:
@@ -86,7 +98,8 @@ def work(
     with PairReader(pairs) as reader, contextlib.ExitStack() as stack:
         opened = [_open(path, reader, stack) for path in maps]
         chosen, notes = _choose(reader, opened, config.split)
-        sizes = {"model": len(ROWS), "pair": len(chosen), "y": reader.size[0], "x": reader.size[1]}
+        names = _names(opened)
+        sizes = {"model": len(names), "pair": len(chosen), "y": reader.size[0], "x": reader.size[1]}
         with ArtefactWriter(
             output.file,
             EVALUATION,
@@ -98,7 +111,7 @@ def work(
             scores = _score(reader, opened, chosen, writer, progress)
             result = _conclude(reader, opened, chosen, scores, config)
             result |= {"pairs_file": pairs.name, "maps": [path.name for path in maps], "warnings": notes}
-            writer.write("model_name", ROWS)
+            writer.write("model_name", names)
             numbers = [k for k, _ in chosen]
             writer.write("pair_index", numbers)
             writer.write("tile", reader.tile[numbers])
@@ -110,6 +123,14 @@ def work(
             for report in report_files(output):
                 write_json(report, result)
     return result
+
+
+def _names(maps: Sequence[AlbedoMap]) -> list[str]:
+    """Of the rows of results: all maps that there are, and the same with a gain and an offset per crop. Raises ArtefactError."""
+    if len({m.refined for m in maps}) > 1:
+        raise ArtefactError(f"{maps[0].path}: expected maps that are all refined or none, found both; name one kind.")
+    names = MAPS[: 2 + maps[0].refined]
+    return [*names, *(f"{name}_gain_offset" for name in names)]
 
 
 def _check_once(maps: Sequence[Path]) -> None:
@@ -139,6 +160,8 @@ def _open(path: Path, reader: PairReader, stack: contextlib.ExitStack) -> Albedo
                 f"{reader.path}:/{name}: expected where on the map a pair lies, found nothing; project again."
             )
     of_map, of_pair = file["elevation"][_part(reader, 0)], reader.known_elevation([0])[0]
+    if "elevation_correction" in file:
+        of_map = of_map - file["elevation_correction"][_part(reader, 0)]
     same = of_map.shape == of_pair.shape
     same = same and not np.nanmax(np.abs(of_map - of_pair), initial=0.0) > SAME_GROUND * reader.gsd
     if not same or abs(float(file.attrs["gsd_m"]) - reader.gsd) > 1e-6 * reader.gsd:
@@ -179,10 +202,10 @@ def _score(
     sun : (pairs,) rad, from the pair's Sun to the nearest of those whose images made the albedo
     within : (3, bands, pairs), see ``coverage.count_within``
     """
-    count = len(chosen)
+    count, rows = len(chosen), len(_names(maps))
     found: dict[str, NDArray] = {
-        "squares": np.zeros((len(ROWS), count)),
-        "ssim": np.full((len(ROWS), count), np.nan),
+        "squares": np.zeros((rows, count)),
+        "ssim": np.full((rows, count), np.nan),
         "pixels": np.zeros(count, np.int32),
         "within": np.zeros((3, len(BANDS_DEG) - 1, count)),
         "sun": np.zeros(count),
@@ -194,7 +217,7 @@ def _score(
         albedo_map, frame = maps[number], int(reader.frame[k])
         pictures = albedo_map.render(reader, k)
         measured, valid = reader.image([k]).double(), reader.valid([k])
-        valid &= torch.isfinite(pictures[1]) & torch.isfinite(pictures[0])
+        valid &= torch.isfinite(torch.stack(pictures)).all(dim=0)
         if reader.units == "dn":
             if (frame, number) not in scales:
                 scales[frame, number] = _image_scales(reader, albedo_map, frame)
@@ -210,8 +233,9 @@ def _score(
             found["squares"][row, n] = ((values - measured[0].numpy())[mask] ** 2).sum()
             found["ssim"][row, n] = ssim(measured[0].numpy(), np.nan_to_num(values), mask, data_range=spread)
         if reader.units == "iof":
-            away = np.abs(pictures[1][0].numpy() - measured[0].numpy())
-            widths, incidence = _intervals(reader, albedo_map.error, k, pictures[1][0].numpy())
+            best = pictures[rows // 2 - 1][0].numpy()
+            away = np.abs(best - measured[0].numpy())
+            widths, incidence = _intervals(reader, albedo_map.error, k, best)
             away[~mask] = np.nan
             found["within"][:, :, n] = count_within(away, widths, incidence)
     return found
@@ -235,12 +259,13 @@ def _image_scales(reader: PairReader, albedo_map: AlbedoMap, frame: int) -> list
     train = np.intersect1d(mine, reader.indices("train"))
     fitted = train if len(train) else mine
     fitted = fitted[:: max(1, len(fitted) // FIT_PAIRS)]
-    gram = FrameGram(1, 2)
+    count = len(_names([albedo_map])) // 2
+    gram = FrameGram(1, count)
     for k in fitted:
-        pictures = torch.stack(albedo_map.render(reader, int(k)))  # (2, 1, h, w)
+        pictures = torch.stack(albedo_map.render(reader, int(k)))  # (maps, 1, h, w)
         valid = reader.valid([k]) & torch.isfinite(pictures).all(dim=0)
         measured = reader.image([k]).double()
-        gram.add(pictures, measured.expand(2, -1, -1), valid.expand(2, -1, -1), np.arange(2))
+        gram.add(pictures, measured.expand(count, -1, -1), valid.expand(count, -1, -1), np.arange(count))
     gain, offset = solve_gain_offset(gram.gram, np.ones(1))
     return list(zip(gain.tolist(), offset.tolist(), strict=True))
 
@@ -274,14 +299,16 @@ def _conclude(
     numbers = np.array([k for k, _ in chosen])
     unit, unit_name = choose_units(reader.tile[numbers], reader.site[numbers])
     models = {}
-    for k, name in enumerate(ROWS):
+    names = _names(maps)
+    for k, name in enumerate(names):
         mse = ratio_interval(scores["squares"][k], pixels, unit, ERROR)
         models[name] = {"mse": mse.value, "mse_low": finite(mse.low), "mse_high": finite(mse.high)}
         models[name]["ssim"] = finite(float(np.nanmean(scores["ssim"][k])))
     gains = {}
-    for ours, other in ((1, 0), (3, 2)):
-        gain = gain_interval(scores["squares"][ours], scores["squares"][other], unit)
-        gains[ROWS[ours]] = {ROWS[other]: gain_entry(gain)}
+    for ours in (k for k in range(len(names)) if k % (len(names) // 2)):
+        others = [ours - 1, *([ours - 2] if ours % (len(names) // 2) == 2 else [])]
+        found = {names[k]: gain_interval(scores["squares"][ours], scores["squares"][k], unit) for k in others}
+        gains[names[ours]] = {name: gain_entry(gain) for name, gain in found.items()}
     suns = np.degrees(scores["sun"])
     images = []
     for frame in np.unique(reader.frame[numbers]):
@@ -289,7 +316,7 @@ def _conclude(
         total = max(1.0, float(pixels[mine].sum()))
         row = {"image_id": reader.image_ids[frame], "crops": int(mine.sum())}
         row |= {"nearest_used_sun_deg": float(suns[mine].mean())}
-        row |= {f"mse_{name}": float(scores["squares"][k, mine].sum() / total) for k, name in enumerate(ROWS)}
+        row |= {f"mse_{name}": float(scores["squares"][k, mine].sum() / total) for k, name in enumerate(names)}
         images.append(row)
     return {
         "claim": CLAIM,
@@ -323,19 +350,21 @@ def result_lines(result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
             if ends != ["-", "-"]:
                 text += f" ({' .. '.join(ends)})"
         cells.append([name, f"{row['mse']:.3e}", bounds, "-" if row["ssim"] is None else f"{row['ssim']:.3f}", text])
-    return ["map", "MSE", "95 % interval", "SSIM", "lower MSE than without albedo by"], cells
+    before = "map before" if "refined" in result["models"] else "map without albedo"
+    return ["map", "MSE", "95 % interval", "SSIM", f"lower MSE than the {before} by"], cells
 
 
 def image_lines(result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
     """Columns and cells of the table of images."""
+    maps = [name for name in MAPS if name in result["models"]]
     cells = [
         [
             row["image_id"],
             str(row["crops"]),
             f"{row['nearest_used_sun_deg']:.1f}",
-            f"{row['mse_terrain']:.3e}",
-            f"{row['mse_albedo']:.3e}",
+            *(f"{row[f'mse_{m}']:.3e}" for m in maps),
         ]
         for row in result["images"]
     ]
-    return ["unseen image", "crops", "nearest Sun used, deg", "MSE terrain", "MSE with albedo"], cells
+    titles = ("MSE terrain", "MSE with albedo", "MSE refined")
+    return ["unseen image", "crops", "nearest Sun used, deg", *titles[: len(maps)]], cells

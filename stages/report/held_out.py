@@ -13,8 +13,10 @@ from stages.common.page.sentences import basis, bounds, verdict
 TITLES = {
     "terrain": "map from terrain",
     "albedo": "with albedo from the other photographs",
+    "refined": "with refined elevations and albedo",
     "terrain_gain_offset": "map from terrain, gain + offset per crop",
     "albedo_gain_offset": "with albedo, gain + offset per crop",
+    "refined_gain_offset": "with refined elevations and albedo, gain + offset per crop",
 }
 
 

@@ -248,11 +248,13 @@ def _strength(c: dict) -> float:
 
 
 def _first(c: dict) -> str:
-    return next((cause["effect"] for cause in c["answer"]["causes"]), "")
+    causes = c["answer"]["causes"]
+    return causes[0]["effect"] if causes else ""
 
 
 def _group(c: dict) -> list[str]:
-    return next((cause["group"] for cause in c["answer"]["causes"]), [])
+    causes = c["answer"]["causes"]
+    return causes[0]["group"] if causes else []
 
 
 def _share(part: int, whole: int) -> str:

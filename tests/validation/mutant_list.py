@@ -351,14 +351,14 @@ STAGES = (
         "add_offset of packed numbers is ignored",
     ),
     Mutant(
-        "stages/albedo/posterior.py",
+        "stages/photographs/posterior.py",
         "scaled = weight * np.float32(1.0 / max(spread.own[k, level], 1e-12))",
         "scaled = weight * np.float32(1.0 / max(float(spread.own[:, level].mean()), 1e-12))",
         ("tests/test_albedo.py::test_noisy_images_weigh_less",),
         "all images weigh alike in the albedo, whatever their errors",
     ),
     Mutant(
-        "stages/albedo/posterior.py",
+        "stages/photographs/posterior.py",
         "                    confidence[k, r, c] *= weights[i]\n",
         "",
         ("tests/test_albedo.py::test_what_one_image_shows_alone_loses_its_weight",),

@@ -22,7 +22,7 @@ from stages.physics.horizon.scene import SceneTerrain
 from stages.physics.images.angles import GivenAngles, open_angles
 from stages.physics.images.displacement import Field
 from stages.physics.images.footprints import Footprint, read_footprint
-from stages.physics.images.source_images import Source, open_source
+from stages.physics.images.source_images import Pixels, Source, open_source
 from stages.physics.images.table import Frame, load_frames
 from stages.physics.light.sun_disc import SUN_RADIUS
 from stages.physics.maps.window import Box, Window
@@ -81,6 +81,13 @@ class Observed:
 
 def _sun_at(position: Floats) -> Sun:
     return Sun(position, SUN_RADIUS * AU / float(np.linalg.norm(position)))
+
+
+def far_from_shadow(shadow: Floats32) -> NDArray[np.bool_]:
+    """Where the Sun is whole, SHADOW_MARGIN_PX around included. shadow : (h, w) share of the disc that is hidden"""
+    side = 2 * SHADOW_MARGIN_PX + 1
+    lit = (shadow == 0).astype(np.uint8)
+    return cv2.erode(lit, np.ones((side, side), np.uint8), borderValue=1).astype(bool)
 
 
 class SceneHorizon:
@@ -160,19 +167,11 @@ class References(contextlib.AbstractContextManager):
         inner = self.footprints[k].within(box)
         if inner is None:
             return None
-        pixels = self.source(k).read(*inner, self._fields[k])
+        pixels = self.read(k, inner)
         if not pixels.valid.any():
             return None
-        frame, surface = self.frames[k], self.surface
-        sun = _sun_at(frame.sun_position())
-        camera = frame.camera_position(surface.grid.radius)
-        if pixels.ortho is not None:
-            camera = pixels.ortho.camera_position
-        horizon: Any = SceneHorizon(self.terrain, sun)
-        planes = shade_block(surface, Light(sun, horizon, camera), *inner)
-        lit = (planes["shadow"] == 0).astype(np.uint8)
-        side = 2 * SHADOW_MARGIN_PX + 1
-        far = cv2.erode(lit, np.ones((side, side), np.uint8), borderValue=1).astype(bool)
+        planes = shade_block(self.surface, self.light(k, pixels), *inner)
+        far = far_from_shadow(planes["shadow"])
         known = pixels.valid & np.isfinite(pixels.values) & np.isfinite(planes["image"])
         usable = far & known & (planes["image"] > 0)
         if not usable.any():
@@ -180,6 +179,20 @@ class References(contextlib.AbstractContextManager):
         angles = self._file(k)[1] if self.reads_angles else None
         given = angles.read(inner, self._fields[k]) if angles else {}
         return Seen(inner, np.where(known, pixels.values, np.nan).astype(np.float32), usable, planes, given)
+
+    def read(self, k: int, box: Box) -> Pixels:
+        """Image ``k`` on a window of its footprint, without its displacement."""
+        return self.source(k).read(*box, self._fields[k])
+
+    def light(self, k: int, pixels: Pixels) -> Light:
+        """The light of image ``k`` and its camera, as ``pixels`` of it have them."""
+        frame = self.frames[k]
+        sun = _sun_at(frame.sun_position())
+        camera = frame.camera_position(self.surface.grid.radius)
+        if pixels.ortho is not None:
+            camera = pixels.ortho.camera_position
+        horizon: Any = SceneHorizon(self.terrain, sun)
+        return Light(sun, horizon, camera)
 
     def source(self, k: int) -> Source:
         """The open image ``k``."""

@@ -47,17 +47,17 @@ class Blocks:
         progress(total, total, "rows")
 
 
-def choose_blocks(shape: tuple[int, int], overlapping: Overlapping, halo: int) -> Blocks:
+def choose_blocks(shape: tuple[int, int], overlapping: Overlapping, halo: int, stack_px: int = STACK_PX) -> Blocks:
     """Blocks of BLOCK_PX, smaller where so many images overlap that memory would grow with them.
 
-    halo : px around a block that are read with it
+    halo : px around a block that are read with it; stack_px : pixels of all its images that memory holds
     """
     edge, (rows, cols) = BLOCK_PX, shape
     while edge > max(64, 2 * halo):
         side = edge + 2 * halo
         starts = [(r, c) for r in range(0, rows, edge) for c in range(0, cols, edge)]
         most = max(len(overlapping((r - halo, c - halo, side, side))) for r, c in starts)
-        if most * side * side <= STACK_PX:
+        if most * side * side <= stack_px:
             break
         edge //= 2
     return Blocks(shape, edge)

@@ -28,7 +28,7 @@ from schemas.reading import read_strings
 from stages.physics.maps.grid import Grid
 
 TAGS = ("model", "quantity", "gsd_m", "body_radius_m")
-ALBEDO_BANDS = ("albedo", "albedo_std")
+ALBEDO_BANDS = ("albedo", "albedo_std", "elevation_correction", "elevation_std")
 MOSAIC_BANDS = ("mosaic", "mosaic_std", "mosaic_scatter", "mosaic_images")
 BLOCK, STRIP, COLUMNS = 256, 512, 4096  # px
 

@@ -23,10 +23,13 @@ NODE_PX = 64
 class BlockGeometry:
     """Per pixel (h, w) float32, in axes along the grid (east, north, up).
 
-    sun : 3, unit vector; angles : of the ground; depth : m to the camera, NaN for a view from straight above
+    sun, view : 3, unit vectors; slopes : 2, to the east and north; angles : of the ground
+    depth : m to the camera, NaN for a view from straight above
     """
 
     sun: Floats32
+    view: Floats32
+    slopes: Floats32
     angles: Angles
     depth: Floats32
     longitude_deg: Floats32
@@ -78,7 +81,7 @@ def block_geometry(
     vx, vy, vz = view.unbind(1)
     angles = photometric_angles(slopes[:, 0], slopes[:, 1], toward_sun, (vx, vy, vz))
     cosines = angles.cos_incidence, angles.cos_emission, angles.cos_phase
-    return BlockGeometry(out[2:5], Angles(*(c[0] for c in cosines)), *out[8:])
+    return BlockGeometry(out[2:5], out[5:8], out[0:2], Angles(*(c[0] for c in cosines)), *out[8:])
 
 
 @numba.njit(cache=True, inline="always")

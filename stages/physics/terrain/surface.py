@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import h5py
@@ -124,6 +124,13 @@ class Surface:
         """Whether renderings have standard deviations."""
         return self.deviations is not None or self.albedo_error is not None
 
+    def without_errors(self) -> Surface:
+        """The same without standard deviations and without albedo."""
+        if self.albedo is None:
+            return replace(self, deviations=None)
+        model = self.model.model if isinstance(self.model, AlbedoFactor) else self.model
+        return replace(self, model=model, albedo=None, deviations=None, albedo_error=None)
+
     def read_deviations(self, row: int, col: int, height: int, width: int) -> dict[str, Floats32]:
         """(h, w) standard deviations by name; none where they are unknown."""
         if self.deviations is None:
@@ -230,7 +237,7 @@ def _uniform_surface(
 ) -> Surface:
     """A terrain with one model and one set of parameters everywhere."""
     reflectance, values = _named_model(path, model)
-    return Surface(path, grid, elevation, reflectance, None, uniform_coefficients(reflectance, values, parameters))
+    return Surface(path, grid, elevation, reflectance, None, _uniform(reflectance, values, parameters))
 
 
 def _raw_elevation(dataset: DatasetReader, body: Body) -> Elevation:
@@ -253,7 +260,7 @@ def _named_model(path: Path, model: str | None) -> tuple[ReflectanceModel, dict[
     return find_reflectance(model)
 
 
-def uniform_coefficients(
+def _uniform(
     model: ReflectanceModel, values: Mapping[str, float], parameters: Mapping[str, float]
 ) -> NDArray[np.float32]:
     """(C,) in the model's order. Raises RegistryError or ConfigError.

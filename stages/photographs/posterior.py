@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
-from stages.albedo.pyramid import LEVELS, bands, collapse, enlarge, reduce
 from stages.common.arrays import Floats, Floats32
+from stages.photographs.pyramid import LEVELS, bands, collapse, enlarge, reduce
 
 FREEDOM = 4.0  # degrees of freedom of Student's distribution, as Lange et al. recommend
 ITERATIONS = 8

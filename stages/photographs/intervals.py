@@ -16,9 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.albedo.posterior import Spread, estimate, robust_mean
 from stages.common.arrays import Floats, Floats32
 from stages.common.intervals import unseen_factors
+from stages.photographs.posterior import Spread, estimate, robust_mean
 from stages.physics.images.references import Observed
 
 SHARES = (0.6827, 0.95)
@@ -52,13 +52,13 @@ def unseen_intervals(stacks: Sequence[Stack], spread: Spread, edges: Floats) -> 
     lit = places < bins
     result, shadow = np.tile(np.array(GAUSSIAN)[:, None], bins), np.zeros(2)
     if lit.any():
-        result = _unseen_widths(residuals[lit], places[lit], images[lit], bins)
+        result = unseen_widths(residuals[lit], places[lit], images[lit], bins)
         if not lit.all():
-            shadow = _unseen_widths(residuals[~lit], places[~lit] - bins, images[~lit], 1)[:, 0]
+            shadow = unseen_widths(residuals[~lit], places[~lit] - bins, images[~lit], 1)[:, 0]
     return result, shadow
 
 
-def _unseen_widths(residual: Floats32, place: NDArray[np.intp], image: NDArray[np.intp], bins: int) -> Floats:
+def unseen_widths(residual: Floats32, place: NDArray[np.intp], image: NDArray[np.intp], bins: int) -> Floats:
     """(2, bins) half-widths that hold for an image that is not among these, on the average over such images.
 
     residual : (N,) absolute; place, image : (N,) bins and images of them

@@ -20,11 +20,11 @@ from scipy.special import stdtrit
 
 from schemas.checks import parse_json
 from schemas.errors import ArtefactError
-from stages.albedo.intervals import GAUSSIAN, Stack, unseen_intervals
-from stages.albedo.posterior import Spread, robust_mean
-from stages.albedo.pyramid import LEVELS, bands
 from stages.common.arrays import Floats, Floats32
 from stages.common.progress import Progress, show_nothing
+from stages.photographs.intervals import GAUSSIAN, Stack, unseen_intervals
+from stages.photographs.posterior import Spread, robust_mean
+from stages.photographs.pyramid import LEVELS, bands
 from stages.physics.formation.radiometry import fit_line
 from stages.physics.images.displacement import Field
 from stages.physics.images.references import Observed, References
@@ -65,8 +65,8 @@ class Calibration:
         confidence = 1.0 / np.interp(observed.cos_incidence, _middles(), self.error)
         return ratio, np.where(known, confidence, 0).astype(np.float32)
 
-    def write(self, path: Path, made_from: dict[str, Any]) -> None:
-        """Write it as JSON. made_from : the inputs and options that it holds for"""
+    def as_text(self) -> dict[str, Any]:
+        """What JSON holds of it."""
         values = {"gain": self.gain, "offset": self.offset, "error": self.error}
         values |= {"interval": self.interval, "shadow": self.shadow}
         values |= {
@@ -76,29 +76,36 @@ class Calibration:
             "own_px": self.spread.own_px,
         }
         text: dict[str, Any] = {k: v.tolist() for k, v in values.items()} | {"shared_px": self.spread.shared_px}
-        text |= {"fields": as_text(self.fields), "made_from": made_from}
-        path.write_text(json.dumps(text))
+        return text | {"fields": as_text(self.fields)}
 
     @staticmethod
-    def read(path: Path, made_from: dict[str, Any]) -> Calibration:
-        """Read what :meth:`write` wrote for the same inputs and options. Raises ArtefactError for anything else."""
-        advice = "make it with 'lunargr albedo ... -o calibration.json'"
-        try:
-            text = parse_json(path.read_text(), str(path), advice=advice)
-        except (OSError, UnicodeDecodeError) as error:
-            raise ArtefactError(f"{path}: expected a calibration as JSON, found none ({error}); {advice}.") from None
-        found = text.pop("made_from", None) if isinstance(text, dict) else None
-        if found != made_from:
-            changed = (
-                [k for k, v in made_from.items() if found.get(k) != v] if isinstance(found, dict) else ["made_from"]
-            )
-            raise ArtefactError(
-                f"{path}: expected the calibration of these files and options, found another ({', '.join(changed)}); {advice}."
-            )
-        shared_px, fields = float(text.pop("shared_px")), tuple(from_text(text.pop("fields")))
-        v = {k: np.array(values, float) for k, values in text.items()}
+    def from_text(text: dict[str, Any]) -> Calibration:
+        """The inverse of :meth:`as_text`."""
+        shared_px, fields = float(text["shared_px"]), tuple(from_text(text["fields"]))
+        v = {k: np.array(values, float) for k, values in text.items() if k not in ("shared_px", "fields")}
         spread = Spread(v["shared"], v["own"], shared_px, v["own_px"], v["prior"])
         return Calibration(v["gain"], v["offset"], spread, v["error"], v["interval"], v["shadow"], fields)
+
+
+def write_calibration(path: Path, text: dict[str, Any], made_from: dict[str, Any]) -> None:
+    """Write a calibration as JSON. made_from : the inputs and options that it holds for"""
+    path.write_text(json.dumps(text | {"made_from": made_from}))
+
+
+def read_calibration(path: Path, made_from: dict[str, Any], command: str) -> dict[str, Any]:
+    """Read what :func:`write_calibration` wrote for the same inputs and options. Raises ArtefactError for anything else."""
+    advice = f"make it with 'lunargr {command} ... -o calibration.json'"
+    try:
+        text = parse_json(path.read_text(), str(path), advice=advice)
+    except (OSError, UnicodeDecodeError) as error:
+        raise ArtefactError(f"{path}: expected a calibration as JSON, found none ({error}); {advice}.") from None
+    found = text.pop("made_from", None) if isinstance(text, dict) else None
+    if found != made_from:
+        changed = [k for k, v in made_from.items() if found.get(k) != v] if isinstance(found, dict) else ["made_from"]
+        raise ArtefactError(
+            f"{path}: expected the calibration of these files and options, found another ({', '.join(changed)}); {advice}."
+        )
+    return text
 
 
 @dataclass
