@@ -30,6 +30,7 @@ FITTED = {
 }
 DEMO, APOLLO, PAPER = "make demo-full", "make reproduce-apollo15", "make reproduce-models"
 ALBEDO = "make demo-albedo"
+SCALING = "python tests/validation/benchmarks/bench_scaling.py --docs docs/resources.md"
 # Of two rows that are one model under two names the table keeps one: (model of the network, row left out, row that is kept)
 TWICE = (
     ("hapke", "global", "hapke_fitted"),
@@ -323,16 +324,12 @@ def campaigns(root: Path) -> list[str]:
     try:
         text = (root / "docs" / "resources.md").read_text()
     except FileNotFoundError:
-        raise Absent(
-            "docs/resources.md", "python tests/validation/benchmarks/bench_scaling.py --docs docs/resources.md"
-        ) from None
+        raise Absent("docs/resources.md", SCALING) from None
     rates = {m[1]: (m[2], float(m[3]), m[4]) for m in RATE.finditer(text)}
     rows = []
     for stage, *works in CAMPAIGNS:
         if stage not in rates:
-            raise Absent(
-                f"the rate of {stage}", "python tests/validation/benchmarks/bench_scaling.py --docs docs/resources.md"
-            )
+            raise Absent(f"the rate of {stage}", SCALING)
         peaks, rate, unit = rates[stage]
         memory = max(float(p.replace(",", "")) for p in peaks.split(", ")) / 1e3
         times = ["" if work is None else duration(rate * work) for work in works]
@@ -376,16 +373,8 @@ def diagnose_campaigns(root: Path) -> list[str]:
                 found = [share(chosen, *columns) for columns in (
                     ("false_names", "nulls"), ("named_first", "plants"), ("another_first", "plants"), ("faults_in_words", "faults"))]  # fmt: skip
                 rows.append([f"{kind}, {name}", *found])
-    return table(
-        [
-            "data",
-            "name although nothing was planted",
-            "planted effect named first",
-            "another effect named first",
-            "camera fault described",
-        ],
-        rows,
-    )
+    columns = ("data", "name although nothing was planted", "planted effect named first", "another effect named first")
+    return table([*columns, "camera fault described"], rows)
 
 
 def share(rows: list[dict[str, str]], part: str, whole: str) -> str:

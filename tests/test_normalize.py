@@ -313,6 +313,11 @@ def test_shards_merge_to_the_same_bytes_and_geotiff(planted, tmp_path, monkeypat
         assert one.tags()["quantity"].endswith("at the standard geometry")
 
 
+def test_a_set_by_wavelength_needs_one(planted, tmp_path):
+    with pytest.raises(ConfigError, match="expected a known wavelength, to choose a set of sato2014, found none"):
+        normalize.run(planted[0].scene, None, tmp_path / "n.h5", replace(QUIET, model="sato2014"))
+
+
 def test_wrong_options_are_one_line(planted, tmp_path):
     scene, _ = planted
     for change, with_map, message in (
@@ -356,6 +361,13 @@ def test_bands_of_one_file_get_mosaics_of_their_own(tmp_path):
     assert name.tolist() == [b"415nm", b"643nm"] and wavelength.tolist() == [415, 415, 643, 643]
     for layer, factor in zip(mosaic, (1, 3), strict=True):
         np.testing.assert_allclose(layer[np.isfinite(layer)], factor * FLAT, rtol=1e-4)
+    by_set = {}
+    for model in ("sato2014", "sato2014_415nm", "sato2014_643nm"):
+        normalize.run(scene, None, Output(out, overwrite=True), replace(QUIET, model=model))
+        (by_set[model],) = maps(out, "normalized")
+    np.testing.assert_allclose(by_set["sato2014"][:2], by_set["sato2014_415nm"][:2], rtol=1e-6)
+    np.testing.assert_allclose(by_set["sato2014"][2:], by_set["sato2014_643nm"][2:], rtol=1e-6)
+    assert not np.allclose(by_set["sato2014_415nm"][:2], by_set["sato2014_643nm"][:2], equal_nan=True)
     for cell, message in (
         ("", "expected .* of one band, found 2; name the one that is meant in column 'band'"),
         ("3", "with a band 3, found 2"),

@@ -26,7 +26,8 @@ def command(
         typer.Option(
             "--model",
             autocompletion=options.complete_model,
-            help="Reflectance model or published set, such as hapke or sato2014_643nm; 'lunargr models' lists them.",
+            help="Reflectance model or published set, such as hapke or sato2014_643nm; sato2014: the set nearest to "
+            "each image's wavelength. 'lunargr models' lists them.",
         ),
     ] = None,
     parameters: Annotated[

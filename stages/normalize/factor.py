@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -25,10 +26,14 @@ UNSEEN, GOOD, SHADOW, GRAZING = range(4)
 
 @dataclass(frozen=True)
 class Normaliser:
-    """surface : terrain with its reflectance, on whose grid the images lie"""
+    """surface : terrain with its reflectance, on whose grid the images lie
+
+    by_image : (C,) coefficients of each image's own wavelength; empty where the surface's hold for all
+    """
 
     surface: Surface
     config: Config
+    by_image: Sequence[NDArray[np.float32]] = ()
 
     @cached_property
     def _model(self) -> NormalisingFactor:
@@ -42,13 +47,13 @@ class Normaliser:
         given = self.angles(seen)
         return Angles.from_angles(*(torch.from_numpy(np.radians(given[plane])) for plane in PLANES))
 
-    def _values(self, seen: Seen) -> dict[str, torch.Tensor]:
-        coefficients = torch.from_numpy(np.ascontiguousarray(self.surface.read_coefficients(*seen.box)))
-        return self.surface.model.unpack(coefficients, dim=0)
+    def _values(self, image: int, seen: Seen) -> dict[str, torch.Tensor]:
+        own = self.by_image[image][:, None, None] if self.by_image else self.surface.read_coefficients(*seen.box)
+        return self.surface.model.unpack(torch.from_numpy(np.ascontiguousarray(own)), dim=0)
 
-    def predicted(self, seen: Seen) -> Floats32:
-        """(h, w) I/F of the model in full sunlight."""
-        return masked_radiance_factor(self.surface.model, self._values(seen), self._radians(seen)).numpy()
+    def predicted(self, image: int, seen: Seen) -> Floats32:
+        """(h, w) I/F of the model in full sunlight, for the image of this number."""
+        return masked_radiance_factor(self.surface.model, self._values(image, seen), self._radians(seen)).numpy()
 
     def mask(self, seen: Seen) -> NDArray[np.uint8]:
         """(h, w) UNSEEN, GOOD, SHADOW (or within two pixels of one) or GRAZING."""
@@ -60,12 +65,12 @@ class Normaliser:
         found[np.isnan(seen.measured) | np.isnan(incidence + emission + phase)] = UNSEEN
         return found
 
-    def factor(self, seen: Seen, good: Mask) -> tuple[Floats32, Floats32]:
+    def factor(self, image: int, seen: Seen, good: Mask) -> tuple[Floats32, Floats32]:
         """(h, w) factor to the standard geometry, NaN where not ``good``, and its relative standard deviation.
 
         The latter is that of the map's coefficients, 0 where none is known.
         """
-        values, angles = self._values(seen), self._radians(seen)
+        values, angles = self._values(image, seen), self._radians(seen)
         factor = masked_radiance_factor(self._model, values, angles).numpy()
         deviations = {k: torch.from_numpy(v) for k, v in self.surface.read_deviations(*seen.box).items()}
         spread = radiance_deviation(self._model, values, deviations, angles).numpy()

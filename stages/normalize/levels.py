@@ -75,7 +75,7 @@ def take_samples(
             cosine = np.cos(np.radians(normaliser.angles(seen)["incidence_deg"]))
             away = [seen.given[plane] - seen.planes[plane] if seen.given else 0 * cosine for plane in PLANES]
             planes = np.stack(
-                [seen.measured, normaliser.predicted(seen), normaliser.factor(seen, good)[0], cosine, *away]
+                [seen.measured, normaliser.predicted(k, seen), normaliser.factor(k, seen, good)[0], cosine, *away]
             )
             planes[:, np.isnan(planes[2])] = np.nan
             images.append(k)

@@ -7,7 +7,8 @@ as wide as weights fade, so that blocks leave no edges.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -32,7 +33,8 @@ from stages.physics.images.windows import Blocks, choose_blocks
 from stages.physics.maps.geotiff import write_geotiff
 from stages.physics.maps.grid import check_same_grid
 from stages.physics.maps.window import Box, Window
-from stages.physics.terrain.surface import open_surface
+from stages.physics.photometry.published import ParameterSet, find_reflectance, sets_by_wavelength
+from stages.physics.terrain.surface import open_surface, uniform_coefficients
 
 
 @dataclass(frozen=True)
@@ -118,7 +120,9 @@ def open_ground(scene: Path, svbrdf: Path | None, config: Config) -> Iterator[Gr
             check_same_grid(svbrdf, stack.enter_context(open_artefact(svbrdf, SVBRDF)), scene, terrain)
         frames = load_frames(terrain, scene)
         body = find_body(str(terrain.attrs["body_radius_m"]))
-        surface = stack.enter_context(open_surface(svbrdf or scene, config.model, config.parameters, body))
+        sets = sets_by_wavelength(config.model or "")
+        model = next(iter(sets.values())).name if sets else config.model
+        surface = stack.enter_context(open_surface(svbrdf or scene, model, config.parameters, body))
         references = stack.enter_context(open_references(scene, terrain, surface, _used(scene, frames, config)))
         references.reads_angles = True
         without = [frame.image_id for frame in references.frames if frame.angles is None]
@@ -129,7 +133,19 @@ def open_ground(scene: Path, svbrdf: Path | None, config: Config) -> Iterator[Gr
         units = {frame.units for frame in references.frames}
         if len(units) > 1:
             raise InputError(f"{scene}: expected one kind of units, found both 'iof' and 'dn'; ingest them apart.")
-        yield Ground(references, Normaliser(surface, config), units.pop())
+        by_image = [_of_wavelength(frame, sets, config) for frame in references.frames] if sets else []
+        yield Ground(references, Normaliser(surface, config, by_image), units.pop())
+
+
+def _of_wavelength(frame: Frame, sets: Mapping[float, ParameterSet], config: Config) -> NDArray[np.float32]:
+    """(C,) of the set whose wavelength is nearest to the image's."""
+    if math.isnan(frame.wavelength_nm):
+        raise ConfigError(
+            f"image '{frame.image_id}': expected a known wavelength, to choose a set of {config.model}, found none; "
+            f"name one set, such as {next(iter(sets.values())).name}."
+        )
+    nearest = sets[min(sets, key=lambda nm: abs(nm - frame.wavelength_nm))]
+    return uniform_coefficients(*find_reflectance(nearest.name), config.parameters)
 
 
 def _used(scene: Path, frames: Sequence[Frame], config: Config) -> list[bool]:
@@ -152,7 +168,7 @@ def work_block(ground: Ground, levels: Levels, block: Box) -> Block:
         if seen is None:
             continue
         mask, angles = normaliser.mask(seen), normaliser.angles(seen)
-        factor, spread = normaliser.factor(seen, mask == GOOD)
+        factor, spread = normaliser.factor(k, seen, mask == GOOD)
         normal = (seen.measured - np.float32(levels.offset[k])) / np.float32(levels.gain[k]) * factor
         own_error = levels.deviation(k, np.cos(np.radians(angles["incidence_deg"])))
         std = np.abs(normal) * np.hypot(own_error, spread)

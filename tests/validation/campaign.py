@@ -248,13 +248,11 @@ def _strength(c: dict) -> float:
 
 
 def _first(c: dict) -> str:
-    causes = c["answer"]["causes"]
-    return causes[0]["effect"] if causes else ""
+    return next((cause["effect"] for cause in c["answer"]["causes"]), "")
 
 
 def _group(c: dict) -> list[str]:
-    causes = c["answer"]["causes"]
-    return causes[0]["group"] if causes else []
+    return next((cause["group"] for cause in c["answer"]["causes"]), [])
 
 
 def _share(part: int, whole: int) -> str:

@@ -161,6 +161,12 @@ def hapke_set(wavelength_nm: float, name: str | None = None) -> ParameterSet:
     return known[f"sato2014_{min(_SATO_MEAN, key=lambda band: abs(band - wanted))}nm"]
 
 
+def sets_by_wavelength(family: str) -> dict[float, ParameterSet]:
+    """Sets of one publication by wavelength in nm, such as those of 'sato2014'; empty where it has none."""
+    every = (s for s in _SETS.values() if s.wavelength_nm is not None)
+    return {s.wavelength_nm: s for s in every if s.name == f"{family.lower()}_{s.wavelength_nm:g}nm"}
+
+
 def find_reflectance(name: str) -> tuple[ReflectanceModel, dict[str, float]]:
     """A model and its default values by its name, or a published set's by the name of the set.
 

@@ -237,7 +237,7 @@ def _uniform_surface(
 ) -> Surface:
     """A terrain with one model and one set of parameters everywhere."""
     reflectance, values = _named_model(path, model)
-    return Surface(path, grid, elevation, reflectance, None, _uniform(reflectance, values, parameters))
+    return Surface(path, grid, elevation, reflectance, None, uniform_coefficients(reflectance, values, parameters))
 
 
 def _raw_elevation(dataset: DatasetReader, body: Body) -> Elevation:
@@ -260,7 +260,7 @@ def _named_model(path: Path, model: str | None) -> tuple[ReflectanceModel, dict[
     return find_reflectance(model)
 
 
-def _uniform(
+def uniform_coefficients(
     model: ReflectanceModel, values: Mapping[str, float], parameters: Mapping[str, float]
 ) -> NDArray[np.float32]:
     """(C,) in the model's order. Raises RegistryError or ConfigError.
