@@ -319,6 +319,26 @@ CAMPAIGNS = (
 )
 
 
+def detail(root: Path) -> list[str]:
+    """Invented relief beside real: features in pictures, and power about the Nyquist frequency."""
+    found = read(root, "results/detail.json", "python tests/validation/detail.py")
+    names = ("whole", "with detail", "without")
+    features = [
+        [f"SIFT features a km2, Sun at {sun:g} deg", *(f"{found['sift_per_km2'][name][k]:.0f}" for name in names)]
+        for k, sun in enumerate(found["suns_deg"])
+    ]
+    power = [
+        [
+            f"power of {kind}, octave {side} Nyquist",
+            "1",
+            *(f"{found['power_of_whole'][kind][name][k]:.2f}" for name in names[1:]),
+        ]
+        for kind in ("slope", "brightness")
+        for k, side in enumerate(("below", "above"))
+    ]
+    return table(["", "whole DEM", "with detail", "without"], features + power)
+
+
 def campaigns(root: Path) -> list[str]:
     """Processor time of large work, from the rates that bench_scaling measured and wrote into the page."""
     try:
@@ -398,6 +418,7 @@ BLOCKS: dict[str, Callable[[Path], list[str]]] = {
     "diagnose-campaigns": diagnose_campaigns,
     "demo-sizes": sizes,
     "campaigns": campaigns,
+    "detail": detail,
 }
 
 

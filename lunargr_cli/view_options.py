@@ -160,6 +160,19 @@ Spin = Annotated[
     str | None,
     typer.Option("--spin", metavar="R,D,F", help="Rotation about the camera's right, down and forward axes, deg/s."),
 ]
+Detail = Annotated[
+    int | None,
+    typer.Option(
+        "--detail",
+        metavar="SEED",
+        min=0,
+        max=2**63 - 1,
+        help="Camera views: invent craters, rocks and roughness below the DEM's pixels; the channel 'invented' shows them.",
+    ),
+]
+RockAbundance = Annotated[
+    float, typer.Option("--rock-abundance", metavar="SHARE", help="Share of the ground under rocks, with --detail.")
+]
 Samples = Annotated[
     int | None,
     typer.Option(metavar="N", help="N x N rays per pixel (default: one per DEM pixel and axis, 2 to 8)."),

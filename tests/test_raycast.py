@@ -171,6 +171,6 @@ def test_samples_ignore_unknown_pixels():
     ramp = np.tile(np.arange(16, dtype=np.float32), (16, 1))
     holed = ramp.copy()
     holed[:, 8] = np.nan
-    values = sample_maps(np.stack([ramp, ramp.T, holed, np.full_like(ramp, np.nan)]), hits)[:, 0]
+    values = sample_maps(np.stack([ramp, ramp.T, holed, np.full_like(ramp, np.nan)]), hits.row, hits.col)[:, 0]
     np.testing.assert_allclose(values[:3], [7.5, 7.25, 7.0], atol=2e-3)
     assert np.isnan(values[3])

@@ -18,7 +18,9 @@ from stages.physics.terrain.shading import Light
 from stages.physics.terrain.sun import Sun, sun_from_angles
 from stages.physics.terrain.sun_visibility import SunHorizon
 from stages.physics.terrain.surface import Surface
-from stages.render.perspective import make_scene, render_view
+from stages.render.grounds import Grounds
+from stages.render.perspective import render_view
+from stages.render.scene import make_scene
 from stages.render.viewpoint import look_at, pinhole_view
 
 mi = pytest.importorskip("mitsuba", reason="the test extra brings mitsuba")
@@ -144,7 +146,7 @@ def test_views_agree_with_mitsuba(scenes, tmp_path, name, sun_elevation_deg):
     surface = lambert_surface(tmp_path, grid, z)
     relief = (float(z.min()), float(z.max()))
     light = Light(sun, SunHorizon(surface.elevation, grid, sun, relief[1] - relief[0]), None)
-    bands = list(render_view(surface, camera, light, make_scene(surface, camera, light, relief, 4)))
+    bands = list(render_view(surface, camera, light, make_scene(Grounds(surface), camera, light, relief, 4)))
     ours = {k: np.concatenate([b[k] for b in bands]) for k in bands[0]}
     theirs, depth = peer.image(sun, camera, 36), peer.depth(sun, camera)
     both = np.isfinite(ours["depth"]) & np.isfinite(depth)
@@ -189,7 +191,7 @@ def test_one_bounce_agrees_with_mitsuba(scenes, tmp_path, name):
     images = []
     for bounce in (None, Bounce(surface, sun, horizon)):
         light = Light(sun, horizon, None, bounce=bounce)
-        bands = render_view(surface, camera, light, make_scene(surface, camera, light, relief, 2))
+        bands = render_view(surface, camera, light, make_scene(Grounds(surface), camera, light, relief, 2))
         images.append(np.concatenate([b["image"] for b in bands]))
     ours = images[1] - images[0]
     theirs = peer.image(sun, camera, 256, bounces=1) - peer.image(sun, camera, 256)

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from stages.simulate import craters, make_config
-from stages.simulate.noise import fractal
+from stages.physics.relief import craters
+from stages.physics.relief.noise import fractal
+from stages.simulate import make_config
 from stages.simulate.terrain import Terrain
 
 

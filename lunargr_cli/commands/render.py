@@ -29,6 +29,7 @@ from lunargr_cli.view_options import (
     Camera,
     Convergence,
     Dem,
+    Detail,
     EarthAzimuth,
     EarthElevation,
     Earthshine,
@@ -43,6 +44,7 @@ from lunargr_cli.view_options import (
     Quaternion,
     RenderOutput,
     Rig,
+    RockAbundance,
     Roll,
     Samples,
     Sensor,
@@ -94,6 +96,8 @@ def command(
     sensor: Sensor = None,
     velocity: Velocity = None,
     spin_deg: Spin = None,
+    detail: Detail = None,
+    rock_abundance: RockAbundance = Config.rock_abundance,
     samples: Samples = None,
     trajectory: Trajectory = None,
     export: Export = None,
@@ -136,9 +140,9 @@ def command(
         manifest = render.run_stereo(path, to, config, drawn, console.progress)
         console.say(f"{manifest}: {stereo} stereo pairs")
     elif trajectory is not None:
-        _show(render.run_trajectory(path, trajectory, to, config, console.progress), console)
+        _show(render.run_trajectory(path, trajectory, to, config, console.progress), config, console)
     else:
-        _show([render.run(path, to, config, console.progress)], console)
+        _show([render.run(path, to, config, console.progress)], config, console)
 
 
 def find_source(given: Options) -> Path:
@@ -181,7 +185,18 @@ def _converted(given: Options) -> dict[str, Any]:
     modes = [option for option in ("camera", "trajectory") if given[option]]
     if given["view"] == "ortho" and modes:
         raise ConfigError(f"--{modes[0]}: expected without --view ortho; leave one of them out.")
-    attitude = ("look_at", "quaternion", "roll_deg", "fov_deg", "size_px", "velocity", "spin_deg", "sensor", "stereo")
+    attitude = (
+        "look_at",
+        "quaternion",
+        "roll_deg",
+        "fov_deg",
+        "size_px",
+        "velocity",
+        "spin_deg",
+        "sensor",
+        "detail",
+        "stereo",
+    )
     seen_by_camera = modes or any(given[name] is not None for name in attitude)
     implied = "pinhole" if seen_by_camera else Config.view
     return {
@@ -203,7 +218,7 @@ def _converted(given: Options) -> dict[str, Any]:
     }
 
 
-def _show(results: list[Summary], console: Console) -> None:
+def _show(results: list[Summary], config: Config, console: Console) -> None:
     """The table of what was rendered."""
     brightness = NAMES[results[0].image_units] if results else NAMES["iof"]
     console.table(
@@ -218,9 +233,9 @@ def _show(results: list[Summary], console: Console) -> None:
                 f"{r.view_id}: the model gives {brightness} below 0 in {r.clipped} pixels ({share:.2%}); they are drawn as 0."
             )
     finest = max(results, key=lambda r: r.pixels_per_post if r.pixels_per_post > SMOOTH else 0.0, default=None)
-    if finest is not None and finest.pixels_per_post > SMOOTH:
+    if finest is not None and finest.pixels_per_post > SMOOTH and config.detail is None:
         console.say(
-            f"{finest.view_id}: {finest.pixels_per_post:.0f} image pixels to a DEM pixel; the picture shows no detail between them."
+            f"{finest.view_id}: {finest.pixels_per_post:.0f} image pixels to a DEM pixel; the picture shows no detail between them (--detail invents some)."
         )
 
 

@@ -10,7 +10,7 @@ import typer
 from lunargr_cli.commands.render import find_source
 from lunargr_cli.console import flush_out, write_out
 from lunargr_cli.options import BodyOption, configure, read_parameters
-from lunargr_cli.view_options import Dem, Model, Parameters, Samples, Sensor, Shadows, Source
+from lunargr_cli.view_options import Dem, Detail, Model, Parameters, RockAbundance, Samples, Sensor, Shadows, Source
 from stages.render import Config
 
 NAME, ORDER = "serve", 62
@@ -26,6 +26,8 @@ def command(
     model: Model = None,
     parameters: Parameters = None,
     sensor: Sensor = None,
+    detail: Detail = None,
+    rock_abundance: RockAbundance = Config.rock_abundance,
     samples: Samples = None,
     shadows: Shadows = Config.shadows,
     body: BodyOption = None,

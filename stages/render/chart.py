@@ -69,7 +69,7 @@ def fit_chart(grid: Grid) -> Chart:
 
 
 def axes_about(up: Floats) -> Floats:
-    """East, north, up about a place; any east will do at a pole."""
+    """(3, 3) rows east, north, up about a place (3,); any east will do at a pole."""
     east = np.cross([0.0, 0.0, 1.0], up)
     if np.linalg.norm(east) < 1e-9:
         east = np.array([0.0, 1.0, 0.0])

@@ -35,7 +35,7 @@ CAMERA = (
 # What each kind of view does not look at: set all the same, it would be ignored.
 _ATTITUDE = ("look_at", "quaternion", "roll_deg", "fov_deg", "size_px")
 IGNORED = {
-    "`view` ortho": (*_ATTITUDE, *RATES, "samples", "sensor", "png_only", "rig"),
+    "`view` ortho": (*_ATTITUDE, *RATES, "samples", "sensor", "detail", "rock_abundance", "png_only", "rig"),
     "`camera`": (*_ATTITUDE, "position", "backplanes_in_tif", "png_only", "rig"),
     "a trajectory": ("position", "quaternion", "roll_deg", *RATES, "backplanes_in_tif"),
     "`camera` in a trajectory": ("fov_deg", "size_px"),
@@ -57,6 +57,8 @@ class Config:
     camera : path of a camera model (JSON), instead of position, attitude, fov and size; of a trajectory instead of fov and size
     velocity : m/s towards east, north and up; spin_deg : deg/s about the camera's axes: for a sensor's exposure and lines
     sensor : a preset's name or a JSON file: DN beside the I/F, with noise drawn from ``seed`` and the view's name
+    detail : seed of invented relief where a camera view has several pixels to one of the map; None for none
+    rock_abundance : share of the ground that rocks cover, in invented relief
     samples : rays per pixel and axis (None: as many as the pixel's footprint asks for)
     model, parameters : a reflectance that is the same everywhere, where the source holds none
     rig : m from a left camera to a right one beside it: two views of each row of a trajectory, or how stereo pairs are drawn
@@ -84,6 +86,8 @@ class Config:
     camera: str | None = None
     sensor: str | None = None
     seed: int = 0
+    detail: int | None = None
+    rock_abundance: float = 0.01
     samples: int | None = None
     shadows: bool = True
     bounce: bool = False
@@ -175,6 +179,7 @@ def check(config: Config, trajectory: bool = False, drawn_sun: bool = False) -> 
     kind = "a trajectory" if trajectory else "`camera`" if config.camera else f"`view` {config.view}"
     refuse_ignored(config, kind)
     check_rig(config)
+    check_detail(config)
     for name in RATES:
         rate = getattr(config, name)
         if rate is not None and config.sensor is None:
@@ -193,6 +198,19 @@ def check_rig(config: Config) -> None:
     """Raises ConfigError for a baseline that cannot be."""
     if config.rig is not None and not 0 < config.rig < LARGEST_RIG:
         raise ConfigError(f"`rig`: expected metres between both cameras, found {config.rig:g}.")
+
+
+def check_detail(config: Config) -> None:
+    """Raises ConfigError for invented relief that cannot be."""
+    if not 1e-4 <= config.rock_abundance <= 0.5:
+        raise ConfigError(f"`rock_abundance`: expected a share in 0.0001..0.5, found {config.rock_abundance:g}.")
+    if config.detail is None:
+        if config.rock_abundance != Config.rock_abundance:
+            raise ConfigError("`rock_abundance`: expected with `detail`, which draws the rocks; found none.")
+        return
+    for name in ("extend", "bounce", "earthshine"):
+        if getattr(config, name):
+            raise ConfigError(f"`{name}`: expected without `detail`, which it does not know; leave one of them out.")
 
 
 def check_trajectory(config: Config) -> None:

@@ -38,7 +38,7 @@ class Moving(Pinhole):
         return replace(self, centre=self.centre + self.velocity * time, rotation=rotation)
 
     def rays(self, line: ArrayLike, sample: ArrayLike) -> tuple[Floats, Floats]:
-        """Those of each line while it was taken."""
+        """(..., 3) each, those of every line while it was taken."""
         origins, directions = super().rays(line, sample)
         if self.line_time == 0:
             return origins, directions
@@ -46,7 +46,7 @@ class Moving(Pinhole):
         return origins + self.velocity * time, turned(directions, self.spin * time)
 
     def ground_to_image(self, points: ArrayLike) -> tuple[Floats, Floats]:
-        """Where the line that is taken meanwhile sees the points, by iteration."""
+        """(...,) each: where the line that is taken meanwhile sees the points (..., 3), by iteration."""
         points = np.asarray(points, float)
         line, sample = super().ground_to_image(points)
         for _ in range(8 if self.line_time else 0):

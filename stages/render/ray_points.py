@@ -99,11 +99,14 @@ def _angles(z, forward, scale, axes, origins, directions, depth, row, col, sun, 
         out[3, n] = math.asin(min(1.0, max(-1.0, (x * sx + y * sy + w * sw) / math.sqrt(x * x + y * y + w * w))))
 
 
-def sample_maps(maps: Floats32, hits: Hits) -> Floats32:
-    """(C, N) bilinear samples of (C, H, W) maps at the hits; unknown pixels (NaN) carry no weight, all unknown is NaN."""
+def sample_maps(maps: Floats32, row: Floats, col: Floats) -> Floats32:
+    """(C, N) bilinear samples of (C, H, W) maps; unknown pixels (NaN) carry no weight, all unknown is NaN.
+
+    row, col : (N,) px, NaN where there is none
+    """
     maps = np.ascontiguousarray(maps, np.float32)
-    result = np.empty((maps.shape[0], len(hits.row)), np.float32)
-    _sample(maps, hits.row, hits.col, result)
+    result = np.empty((maps.shape[0], len(row)), np.float32)
+    _sample(maps, row, col, result)
     return result
 
 

@@ -25,18 +25,20 @@ from stages.physics.cameras import Camera, camera_from_document
 from stages.physics.cameras.pinhole import Pinhole
 from stages.physics.detector import read_sensor
 from stages.physics.detector.readout import photograph
+from stages.physics.relief.detail import Detail
 from stages.physics.terrain.shading import BACKPLANES, Light
 from stages.render.chart import axes_about
 from stages.render.config import CAMERA, RATES, SUN, Config, check
 from stages.render.extended import apply_sensor
 from stages.render.grounds import Grounds
 from stages.render.motion import set_in_motion
-from stages.render.perspective import Scene, make_scene, render_view
+from stages.render.perspective import render_view
+from stages.render.scene import Scene, make_scene
 from stages.render.setup import camera_place, camera_sun, find_camera, make_light, named_sun, open_source
 from stages.render.sight import no_ground
 
 MOST_SUNS = 4  # whose horizons are kept
-PLANES = ("image", *BACKPLANES)  # of a frame
+PLANES = ("image", *BACKPLANES, "invented")  # of a frame
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,7 @@ class Frame:
     image : I/F, mean over each pixel; NaN where the map is unknown, 0 in space
     incidence_deg, emission_deg, phase_deg : degree; shadow : hidden share of the Sun's disc; depth : m along the ray
     longitude_deg, latitude_deg : degree, of the ground at the pixel's centre
+    invented : m that ``detail`` adds to the map's heights
     camera : as :meth:`Renderer.view` was given it; where it moves, all but ``dn`` are of the middle of the exposure; dn : uint16, of the sensor, None without one
     """
 
@@ -58,6 +61,7 @@ class Frame:
     depth: Floats32
     longitude_deg: Floats32
     latitude_deg: Floats32
+    invented: Floats32
     dn: NDArray[np.uint16] | None = None
 
 
@@ -86,7 +90,10 @@ class Renderer:
             self.surface = stack.enter_context(open_source(Path(source), self.config, self._body))
             self.relief = self.surface.height_range()
             self._open = stack.pop_all()
-        self._grounds = Grounds(self.surface)
+        detail = None
+        if self.config.detail is not None:
+            detail = Detail(self.surface.elevation, self.surface.grid, self.config.detail, self.config.rock_abundance)
+        self._grounds = Grounds(self.surface, detail)
         self._lights: OrderedDict[str, Light] = OrderedDict()
 
     def close(self) -> None:
@@ -185,12 +192,12 @@ class Renderer:
 
         samples : rays per pixel and axis, see :class:`Config`; errors : with ``image_std``
         """
-        scene = make_scene(self.surface, camera, light, self.relief, samples, errors, self._grounds)
+        scene = make_scene(self._grounds, camera, light, self.relief, samples, errors)
         bands: Iterable[dict[str, Floats32]] = render_view(self.surface, camera, light, scene)
         if any(effect.slot == "sensor" for effect in light.extensions):  # these need the whole image
             whole = joined(bands)
             named = [name for name in ("image", "exposed") if name in whole]
-            bands = [whole | {name: apply_sensor(whole[name], light, scene.ground.grid) for name in named}]
+            bands = [whole | {name: apply_sensor(whole[name], light, scene.layers[0].ground.grid) for name in named}]
         return scene, bands
 
 
@@ -216,6 +223,6 @@ def _read(name: str, value: Any, where: str) -> Any:
 
 
 def joined(bands: Iterable[dict[str, Floats32]]) -> dict[str, Floats32]:
-    """All lines at once."""
+    """All lines at once, each (lines, samples)."""
     parts = list(bands)
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}

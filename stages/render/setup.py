@@ -32,6 +32,12 @@ from stages.render.files import inputs
 from stages.render.sight import ground_height
 from stages.render.viewpoint import look_at, pinhole_view, place, rotation_from_quaternion
 
+# of an image with detail, for whoever takes it for a photograph's model
+INVENTED = (
+    "relief below the pixels of the elevation model is invented: craters (Trask 1966, Neukum et al. 2001), rocks (Golombek & Rapp 1997), "
+    "fractal roughness; the channel 'invented' holds its height in metres"
+)
+
 
 @contextlib.contextmanager
 def open_source(source: Path, config: Config, body: Body) -> Iterator[Surface]:
@@ -182,7 +188,8 @@ def camera_place(camera: Camera) -> NDArray[np.float64]:
 def metadata(surface: Surface, config: Config, light: Light) -> dict[str, object]:
     """The attributes of a rendered file: source, model, Sun, options, and the record of the run."""
     facts = {k: v for k, v in asdict(config).items() if v not in (None, {}, False) and k != "shard"}
-    return {
+    invented: dict[str, object] = {} if config.detail is None else {"invented": INVENTED}
+    return invented | {
         "source": surface.path.name,
         "model": surface.model.name,
         "quantity": QUANTITIES[surface.image_units],

@@ -11,11 +11,14 @@ from stages.common.arrays import Floats
 from stages.physics.cameras.base import Camera
 from stages.physics.maps.window import Window
 from stages.physics.terrain.surface import Surface
+from stages.render.grounds import LARGEST_REFINED, Ground
 from stages.render.motion import over_exposure
+from stages.render.raycast import HIT, cast
 from stages.render.viewpoint import pixel_footprint
 
 MOST_SAMPLES = 8  # rays per pixel and axis; beyond, the terrain itself is averaged first
 LATTICE = 33  # rays per axis of the first look
+LEVELS = (64, 32, 16, 8, 4, 2)  # pixels of refined ground along one of a surface
 
 
 def seen_window(
@@ -125,3 +128,38 @@ def _check_above_ground(surface: Surface, origins: Floats, relief: tuple[float, 
             raise GeometryError(
                 f"the camera is under the ground: it stands {altitude:.1f} m above the sphere, the ground there at {ground:.1f} m; raise the altitude in `position`."
             )
+
+
+def finer_windows(camera: Camera, ground: Ground, surface: Surface) -> list[tuple[Window, int]]:
+    """Windows of the surface that the camera sees with several image pixels to one of them, and how many are wanted; coarsest first.
+
+    Where not all can be refined, what is near the camera is.
+    """
+    line, sample = (
+        v.ravel() for v in np.meshgrid(*(np.linspace(0, n, LATTICE) for n in (camera.lines, camera.samples)))
+    )
+    hits = cast(ground.field, *camera.rays(line, sample))
+    seen = hits.status == HIT
+    depth, (row, col) = hits.depth[seen], (v[seen] for v in ground.on_surface(hits))
+    wanted = surface.grid.gsd / (pixel_footprint(camera, 1.0) * depth)
+    left, found = np.ones(len(depth), bool), []
+    for finer in LEVELS:
+        here = left & (wanted > finer / 2)
+        for share in (1.0, 0.7, 0.5, 0.35, 0.25, 0.15, 0.1) if here.any() else ():
+            near = here & (depth <= np.quantile(depth[here], share))
+            window = _around(row[near], col[near], ground.window)
+            if window.height * window.width * finer**2 <= LARGEST_REFINED:
+                found.append((window, finer))
+                inner = (row >= window.row) & (row <= window.row + window.height - 1)
+                left &= ~(inner & (col >= window.col) & (col <= window.col + window.width - 1))
+                break
+    return found[::-1]
+
+
+def _around(row: Floats, col: Floats, within: Window) -> Window:
+    """The window of a lattice's places and some room for what lies between them, inside another one."""
+    pad_row, pad_col = (2 + np.ptp(places) * 1.5 / (LATTICE - 1) for places in (row, col))
+    top, left = max(within.row, int(row.min() - pad_row)), max(within.col, int(col.min() - pad_col))
+    bottom = min(within.row + within.height, int(row.max() + pad_row) + 2)
+    right = min(within.col + within.width, int(col.max() + pad_col) + 2)
+    return Window(top, left, bottom - top, right - left)

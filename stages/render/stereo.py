@@ -96,7 +96,7 @@ class _Places:
         self.splits = _split_tiles(len(self.corners), rng)
         self.drawn = 0
 
-    def next_sun(self) -> dict[str, float]:
+    def next_sun(self) -> dict[str, Any]:
         """Settings of a Sun."""
         azimuth, elevation = self.rng.uniform(0, 360), self.rng.uniform(*self.stereo.sun_elevation_deg)
         return {"sun_azimuth_deg": azimuth, "sun_elevation_deg": elevation}

@@ -83,9 +83,10 @@ def render_camera(
     surface, light = renderer.surface, renderer.light(config, camera)
     named = {path.suffix.lower(): path for path in files}
     parts: list[dict[str, Floats32]] = []  # where a sensor takes the image as a whole
-    errors = surface.knows_errors and ".exr" in named
+    errors = surface.knows_errors and ".exr" in named and config.detail is None
     scene, bands = renderer.bands(camera, light, config.samples, errors)
-    channels = ["image", *(["image_std"] if errors else []), *BACKPLANES]
+    invented = [] if config.detail is None else ["invented"]
+    channels = ["image", *(["image_std"] if errors else []), *BACKPLANES, *invented]
     preview, tally, done, ground = Preview(camera.lines, camera.samples, 8192), Tally(surface.image_units), 0, False
     with contextlib.ExitStack() as stack:
         exr = None

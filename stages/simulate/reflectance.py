@@ -14,7 +14,7 @@ from numba import njit, prange
 from schemas.errors import RegistryError
 from stages.common.arrays import Floats32
 from stages.physics.photometry import ReflectanceModel, get_model
-from stages.simulate.noise import fractal, gradient_noise
+from stages.physics.relief.noise import fractal, gradient_noise
 from stages.simulate.recipe import Config
 from stages.simulate.terrain import Ground
 

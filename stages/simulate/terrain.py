@@ -8,8 +8,8 @@ import numpy as np
 from numba import njit
 
 from stages.common.arrays import Floats, Floats32
-from stages.simulate.craters import Craters, populate, stamp
-from stages.simulate.noise import fractal
+from stages.physics.relief.craters import Craters, populate, stamp
+from stages.physics.relief.noise import fractal
 from stages.simulate.recipe import Config
 
 

@@ -33,6 +33,7 @@ class Overview:
     cells : all levels one after the other, row by row, m, NaN where a whole block has no elevation
     starts, shapes : (L,) and (L, 2), where each level begins and its rows and columns
     highest : highest elevation of the scene, m
+    near_px : distance up to which the terrain must be read at full resolution
     """
 
     factor: int
@@ -41,11 +42,7 @@ class Overview:
     starts: NDArray[np.int64]
     shapes: NDArray[np.int64]
     highest: float
-
-    @property
-    def near_px(self) -> int:
-        """Distance up to which the terrain must be read at full resolution."""
-        return self.factor * CELLS_PER_DISTANCE
+    near_px: int
 
 
 def make_overview(elevation: Any, factor: int = 4, rows_at_once: int = 1024) -> Overview:
@@ -72,7 +69,15 @@ def make_overview(elevation: Any, factor: int = 4, rows_at_once: int = 1024) -> 
         levels.append(coarser)
     shapes = np.array([level.shape for level in levels], dtype=np.int64)
     starts = np.concatenate([[0], np.cumsum(shapes.prod(axis=1))[:-1]])
-    return Overview(factor, (height, width), np.concatenate([v.ravel() for v in levels]), starts, shapes, highest)
+    return Overview(
+        factor,
+        (height, width),
+        np.concatenate([v.ravel() for v in levels]),
+        starts,
+        shapes,
+        highest,
+        factor * CELLS_PER_DISTANCE,
+    )
 
 
 @dataclass(frozen=True)
@@ -174,7 +179,7 @@ def horizon_in_scene(
     nodes = np.empty((-(-(height - 1) // NODE) + 1, -(-(width - 1) // NODE) + 1, 2), dtype=np.float32)
     _far_nodes(
         crop, overview.cells, overview.starts, overview.shapes, overview.factor, overview.highest,
-        row, col, east, north, gsd, bend, enough, slope, nodes,
+        overview.near_px, row, col, east, north, gsd, bend, enough, slope, nodes,
     )  # fmt: skip
     _far_pixels(crop, nodes, east, north, gsd, bend, slope)
     return np.arctan(slope, out=slope)
@@ -182,7 +187,7 @@ def horizon_in_scene(
 
 @numba.njit(cache=True, error_model="numpy")
 def _far_nodes(
-    crop, cells, starts, shapes, factor, highest, row, col, east, north, gsd, bend, enough, slope, nodes
+    crop, cells, starts, shapes, factor, highest, near, row, col, east, north, gsd, bend, enough, slope, nodes
 ):  # fmt: skip
     """Distance and height of the far terrain that stands highest, seen from every NODE-th pixel (distance 0: none)."""
     height, width = crop.shape
@@ -202,7 +207,7 @@ def _far_nodes(
             best = max(best, enough)
             if z != z or best == np.inf:
                 continue
-            distance = float(factor * CELLS_PER_DISTANCE)  # px
+            distance = float(near)  # px
             while True:
                 level = 0
                 cell = factor

@@ -30,8 +30,10 @@ from stages.physics.terrain.shading import Light, shade_block
 from stages.physics.terrain.sun import sun_from_angles
 from stages.physics.terrain.sun_visibility import SunHorizon
 from stages.physics.terrain.surface import Surface
-from stages.render.perspective import make_scene, render_view
+from stages.render.grounds import Grounds
+from stages.render.perspective import render_view
 from stages.render.renderer import Renderer
+from stages.render.scene import make_scene
 from stages.render.viewpoint import look_at, pinhole_view
 
 RADIUS, GSD, ALBEDO, FOV = 1737400.0, 5.0, 0.3, 20.0
@@ -46,7 +48,7 @@ def timed(work):
 
 def ours(surface, camera, sun, relief):
     light = Light(sun, SunHorizon(surface.elevation, surface.grid, sun, relief[1] - relief[0]), None)
-    scene = make_scene(surface, camera, light, relief, 2)
+    scene = make_scene(Grounds(surface), camera, light, relief, 2)
     bands = list(render_view(surface, camera, light, scene))
     return np.concatenate([b["image"] for b in bands])
 

@@ -18,7 +18,7 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 from stages.common.arrays import Floats32
-from stages.simulate.noise import gradient_noise
+from stages.physics.relief.noise import gradient_noise
 
 EQUILIBRIUM_PER_KM2 = 10**-1.1  # craters > 1 km per km2, cumulative slope -2
 PRODUCTION_SLOPE, EQUILIBRIUM_SLOPE = 3.0, 2.0
@@ -67,6 +67,21 @@ def cumulative_density(diameter: NDArray | float, density: float, transition: fl
     return at_transition * (d / transition) ** -slope
 
 
+def diameters(share: NDArray, low: float, high: float, density: float, transition: float) -> NDArray:
+    """Diameters between two, m, as the law distributes them; share : (n,) 0 gives ``low``, 1 gives ``high``."""
+    many, few, middle = (float(cumulative_density(d, density, transition)) for d in (low, high, transition))
+    n = (many - share * (many - few)) / middle
+    return transition * np.where(n > 1, n ** (-1 / EQUILIBRIUM_SLOPE), n ** (-1 / PRODUCTION_SLOPE))
+
+
+def depth_factors(scatter: NDArray, diameter: NDArray) -> NDArray:
+    """Depths over those of large fresh craters; scatter, diameter : (n,) about 1, m.
+
+    Shallower and more scattered when small: regolith targets and secondaries (Stopar et al. 2017).
+    """
+    return np.clip(scatter, 0.7, 1.15) * (1 - 0.22 / (1 + (diameter / 150.0) ** 2))
+
+
 def populate(
     bounds: tuple[float, float, float, float],
     smallest: float,
@@ -82,7 +97,6 @@ def populate(
     """
     left, bottom, right, top = bounds
     sizes = []
-    n_transition = float(cumulative_density(transition, density, transition))
     # the margin outside grows with the size, so that small craters are not drawn where they cannot be seen
     edges = np.geomspace(smallest, largest, 25)
     xs, ys = [], []
@@ -91,21 +105,14 @@ def populate(
         area = (right - left + 2 * margin) * (top - bottom + 2 * margin)
         many, few = (float(cumulative_density(d, density, transition)) for d in (low, high))
         count = rng.poisson((many - few) * area)
-        n = many - rng.random(count) * (many - few)
-        below = n > n_transition
-        d = transition * np.where(
-            below, (n / n_transition) ** (-1 / EQUILIBRIUM_SLOPE), (n / n_transition) ** (-1 / PRODUCTION_SLOPE)
-        )
-        sizes.append(d)
+        sizes.append(diameters(rng.random(count), low, high, density, transition))
         xs.append(rng.uniform(left - margin, right + margin, count))
         ys.append(rng.uniform(bottom - margin, top + margin, count))
     diameter, x, y = np.concatenate(sizes), np.concatenate(xs), np.concatenate(ys)
     order = np.argsort(-diameter, kind="stable")
     diameter, x, y = diameter[order], x[order], y[order]
-    oldest = np.minimum(1.0, transition / diameter)
-    age = rng.random(len(x)) * oldest
-    # shallower and more scattered when small: regolith targets and secondaries (Stopar et al. 2017)
-    depth_factor = np.clip(rng.normal(1.0, 0.08, len(x)), 0.7, 1.15) * (1 - 0.22 / (1 + (diameter / 150.0) ** 2))
+    age = rng.random(len(x)) * np.minimum(1.0, transition / diameter)
+    depth_factor = depth_factors(rng.normal(1.0, 0.08, len(x)), diameter)
     craters = Craters(x, y, diameter, age, depth_factor, rng.integers(1, 2**30, len(x)))
     absolute = age * diameter  # lifetimes grow with size: the time since the impact on one clock
     return craters.select(~_buried(x, y, diameter, absolute, rng.random(len(x))))

@@ -35,6 +35,10 @@ def _hash(ix, iy, seed):
 
 _ANGLES = np.arange(256) * (2 * math.pi / 256)
 _GX, _GY = np.cos(_ANGLES), np.sin(_ANGLES)
+_SIDES = (-1.0, 1.0)
+_EDGES = np.array(  # of a cube: gradients in space
+    [e for a in _SIDES for b in _SIDES for e in ((0.0, a, b), (a, 0.0, b), (a, b, 0.0))]
+)
 
 
 @njit(inline="always")
@@ -57,6 +61,32 @@ def gradient_noise(x, y, seed):
     t = v * v * v * (v * (6.0 * v - 15.0) + 10.0)
     top = a + s * (b - a)
     return top + t * (c + s * (d - c) - top)
+
+
+@njit(inline="always")
+def _corner3(ix, iy, iz, seed, dx, dy, dz):
+    k = _hash(ix, iy, seed + iz * 7919) % np.uint32(12)
+    return _EDGES[k, 0] * dx + _EDGES[k, 1] * dy + _EDGES[k, 2] * dz
+
+
+@njit(fastmath=True)
+def gradient_noise3(x, y, z, seed):
+    """One octave in space at (x, y, z) in lattice cells; zero mean (Perlin 2002)."""
+    fx, fy, fz = math.floor(x), math.floor(y), math.floor(z)
+    ix, iy, iz = int(fx), int(fy), int(fz)
+    u, v, w = x - fx, y - fy, z - fz
+    s = u * u * u * (u * (6.0 * u - 15.0) + 10.0)
+    t = v * v * v * (v * (6.0 * v - 15.0) + 10.0)
+    q = w * w * w * (w * (6.0 * w - 15.0) + 10.0)
+    total = 0.0
+    for k in range(2):
+        a = _corner3(ix, iy, iz + k, seed, u, v, w - k)
+        b = _corner3(ix + 1, iy, iz + k, seed, u - 1.0, v, w - k)
+        c = _corner3(ix, iy + 1, iz + k, seed, u, v - 1.0, w - k)
+        d = _corner3(ix + 1, iy + 1, iz + k, seed, u - 1.0, v - 1.0, w - k)
+        top = a + s * (b - a)
+        total += (q if k else 1.0 - q) * (top + t * (c + s * (d - c) - top))
+    return total
 
 
 @njit(parallel=True, fastmath=True, cache=True)
