@@ -69,22 +69,26 @@ def search(state: State, most: int) -> Outcome:
         view, fresh = state.again(view, state.open_names(), shams=SHAMS, candidates=None), False
         out.view = view
         out.best, out.largest = weigh_all(view.whole)
-    finish(state, out)
+    finish(state, out, fresh)
     return out
 
 
-def finish(state: State, out: Outcome) -> None:
-    """Fit all causes together, take out those that are none then, and look at what is left beside the others."""
+def finish(state: State, out: Outcome, fresh: bool = False) -> None:
+    """Fit all causes together, take out those that are none then, and look at what is left beside the others.
+
+    fresh : whether the last look was rendered beside these very causes
+    """
     beside = out.view
     settle(state, beside)
     while doubted := [(c, why) for c in state.named if (why := state.decide(c, sure=True))]:
         cause, why = doubted[-1]  # what was found last stands on the rest
         out.refused[cause.effect.name] = why
         state.causes.remove(cause)
+        fresh = False
         settle(state, beside)
     for cause in state.named:
         out.refused.pop(cause.effect.name, None)
-    if state.causes:
+    if state.causes and not fresh:
         out.view = state.look(state.open_names())
         out.best, out.largest = weigh_all(out.view.whole)
 
