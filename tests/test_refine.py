@@ -93,6 +93,7 @@ def complete(tmp_path_factory):
     return plant(tmp_path_factory.mktemp("complete"), truth, photographs(rng, truth, missing_waves(rng, slope=0.0)))
 
 
+@pytest.mark.slow
 def test_a_dem_that_lacks_nothing_stays_within_its_error_bars_and_albedo_does_not_become_relief(complete, monkeypatch):
     from stages.refine import stage
     from stages.refine.judge import find_out

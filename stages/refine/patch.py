@@ -138,13 +138,14 @@ class Patch:
         geometry = block_geometry(grid, *photograph.box[:2], elevation, light.sun.position, light.camera_position)
         anew = relinearise or photograph.changes is None
         east, north = (torch.from_numpy(s)[None].requires_grad_(anew) for s in geometry.slopes)
-        view = torch.from_numpy(geometry.view)[None].unbind(1)
-        angles = photometric_angles(east, north, torch.from_numpy(geometry.sun)[None], view)
+        vx, vy, vz = torch.from_numpy(geometry.view)[None].unbind(1)
+        angles = photometric_angles(east, north, torch.from_numpy(geometry.sun)[None], (vx, vy, vz))
         values = torch.from_numpy(np.array(self._coefficients[:, *part], np.float32))
         model = self._surface.model
         bright = masked_radiance_factor(model, model.unpack(values, dim=0), angles)
         if anew:
             photograph.changes = torch.cat(torch.autograd.grad(bright.sum(), (east, north))).numpy()
+        assert photograph.changes is not None
         lit = bright.detach()[0].numpy()
         visible = visible_share(geometry.sun_elevation, photograph.horizon, light.sun.radius)
         cosine = geometry.cos_incidence

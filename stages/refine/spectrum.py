@@ -66,9 +66,10 @@ def by_wavelength(power: Floats32) -> Floats:
     below, share = _shares(power.shape)
     values = power.ravel().astype(float)
     values[0] = 0.0  # the mean, of which a correction has none and an albedo may have any
-    return np.bincount(below, values * (1 - share), len(WAVELENGTHS)) + np.bincount(
-        below + 1, values * share, len(WAVELENGTHS)
-    )
+    found = np.zeros(len(WAVELENGTHS))
+    found += np.bincount(below, values * (1 - share), len(WAVELENGTHS))
+    found += np.bincount(below + 1, values * share, len(WAVELENGTHS))
+    return found
 
 
 def waves(fields: Floats32) -> Floats32:
