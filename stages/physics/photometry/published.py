@@ -163,8 +163,8 @@ def hapke_set(wavelength_nm: float, name: str | None = None) -> ParameterSet:
 
 def sets_by_wavelength(family: str) -> dict[float, ParameterSet]:
     """Sets of one publication by wavelength in nm, such as those of 'sato2014'; empty where it has none."""
-    every = (s for s in _SETS.values() if s.wavelength_nm is not None)
-    return {s.wavelength_nm: s for s in every if s.name == f"{family.lower()}_{s.wavelength_nm:g}nm"}
+    known = {s.name: (s.wavelength_nm, s) for s in _SETS.values() if s.wavelength_nm is not None}
+    return {nm: s for name, (nm, s) in known.items() if name == f"{family.lower()}_{nm:g}nm"}
 
 
 def find_reflectance(name: str) -> tuple[ReflectanceModel, dict[str, float]]:
