@@ -20,7 +20,9 @@ import time
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "support"))
+import numpy as np
 import OpenImageIO as oiio
+import rasterio
 from cluster_scene import assert_same, finish, lunargr, stages, start, write_inputs
 
 from schemas import open_artefact, read_kind
@@ -62,12 +64,20 @@ def interrupt(command: list[object], output: Path, how: int, after: float) -> bo
     return alive
 
 
+def pixels(path: Path) -> np.ndarray:
+    """Of a picture; GeoTIFF by rasterio, since OpenImageIO may lack its compression."""
+    if path.suffix != ".tif":
+        return oiio.ImageBuf(str(path)).get_pixels()
+    with rasterio.open(path) as file:
+        return file.read()
+
+
 def compare(name: str, first: Path, second: Path) -> None:
     if second.suffix == ".h5":
         assert_same(first, second)
     else:  # an EXR carries the time of its writing: what counts are the pixels
         for a in sorted(p for p in first.parent.glob(f"{first.stem}.*") if p.suffix != ".json"):
-            x, y = (oiio.ImageBuf(str(p)).get_pixels() for p in (a, second.parent / a.name))
+            x, y = (pixels(p) for p in (a, second.parent / a.name))
             if x.shape != y.shape or x.tobytes() != y.tobytes():
                 raise AssertionError(f"{a.name} differs")
 
