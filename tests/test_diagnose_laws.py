@@ -61,6 +61,8 @@ def test_a_law_is_followed_with_departures_that_are_no_surprise(laws, angles, na
     found = np.linalg.solve(a @ a.T * 1e5 + known, a.sum(1) * level * 1e5)
     assert 100 * np.sqrt(np.mean((found @ a / level - 1) ** 2)) < LEFT[name]
     assert np.abs(found[len(basis) :]).max() < 4
+    amounts = torch.from_numpy(found[len(basis) :])
+    np.testing.assert_allclose(laws.added(amounts, at).numpy(), found[len(basis) :] @ parts, rtol=1e-4, atol=1e-7)
 
 
 def test_between_the_angles_of_a_steep_crater_and_of_all_other_ground_no_law_runs_away():

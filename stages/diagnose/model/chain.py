@@ -22,7 +22,6 @@ from stages.physics.formation.chain import State
 from stages.physics.photometry import ReflectanceModel, lambert_albedo, masked_radiance_factor
 
 STEP = 0.02  # of a slope, as tangent
-MOST_DEPARTED = 2.0  # times the nominal law: its brightness is near nothing in grazing light
 SCATTER = 0.14  # 8 deg: rms slope of relief below a typical DEM's resolution
 
 
@@ -80,29 +79,11 @@ class Chain:
         """(n, H, W) I/F of the law, without what else lights the ground."""
         c = self.coefficients if coefficients is None else coefficients
         out = masked_radiance_factor(self.model, self.model.unpack(c, dim=1), state.angles)
-        if self.amounts is None:
+        if self.laws is None or self.amounts is None:
             return out
-        # facets that turn a little depart from the nominal law by the same share
-        return out + self._departure if state is self._state else out * self._departed
-
-    @cached_property
-    def _departure(self) -> Tensor:
-        """(n, H, W) I/F that the law's departures add."""
-        assert self.amounts is not None
-        return torch.tensordot(self.amounts, self._directions(), 1)
-
-    @cached_property
-    def _departed(self) -> Tensor:
-        """(n, H, W) the law with its departures over the nominal one."""
-        nominal = self._state.reflectance - self._departure
-        return torch.where(nominal > 0, self._state.reflectance / nominal, 1.0).clamp(0.0, MOST_DEPARTED)
-
-    def _directions(self) -> Tensor:
-        """(K, n, H, W) I/F that an amount of 1 in each direction of the law adds."""
-        assert self.laws is not None
-        if self._parts is None:
-            self._parts = self.laws.parts(self._state.angles)
-        return self._parts
+        if state is self._state and self._parts is not None:
+            return out + torch.tensordot(self.amounts, self._parts, 1)
+        return out + self.laws.added(self.amounts, state.angles)
 
     def _expose(
         self, state: State, reflectance: Tensor, effects: Sequence[formation.Extension], measured: bool = True
@@ -186,8 +167,10 @@ class Chain:
         """What another law of the ground adds, (n, H, W) for an amount of 1 in each direction in which measured laws differ."""
         if self.laws is None:
             return []
+        if self._parts is None:
+            self._parts = self.laws.parts(self._state.angles)
         plain = self._state.reflectance
-        return [self._expose(self._state, plain + part, self.base) - self.rendered for part in self._directions()]
+        return [self._expose(self._state, plain + part, self.base) - self.rendered for part in self._parts]
 
     @cached_property
     def slope_tangents(self) -> tuple[Tensor, Tensor]:

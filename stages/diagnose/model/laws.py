@@ -7,6 +7,7 @@ directions of what it leaves (principal components) are open in the model, with 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -26,7 +27,8 @@ ROUGH_DEGREE = 2  # ... and is another one for other parameters: of the polynomi
 SPREAD = 10  # angles of the data for one between them
 SEED = 1
 BLOCK = 1 << 16  # pixels whose products are held at a time
-TERMS = [  # degrees in the three factors
+Term = tuple[int, int, int]  # degrees in the three factors
+TERMS: list[Term] = [
     (i, j, k) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i) for k in range(DEGREE + 1 - i - j)
 ]
 SIMPLE = [n for n, term in enumerate(TERMS) if sum(term) <= ROUGH_DEGREE]
@@ -47,14 +49,24 @@ class Departures:
 
     def parts(self, angles: Angles) -> Tensor:
         """(K, ...) I/F that an amount of 1 in each direction adds, where facets face the Sun and the camera."""
+        return self._sums(self.weights, angles) * _seeliger(angles)
+
+    def added(self, amounts: Tensor, angles: Angles) -> Tensor:
+        """(...) I/F that these amounts (K,) add."""
+        return self._sums(amounts[None].to(self.weights) @ self.weights, angles)[0] * _seeliger(angles)
+
+    def _sums(self, weights: Tensor, angles: Angles) -> Tensor:
+        """(R, ...) sums of all terms, weighted by (R, terms), in blocks of pixels that fit into a processor's cache."""
         shape = angles.cos_incidence.shape
         every = [x.expand(shape).flatten() for x in (angles.cos_incidence, angles.cos_emission, angles.cos_phase)]
-        out = torch.empty(len(self), len(every[0]), dtype=every[0].dtype)
-        weights = self.weights.to(out.dtype)
-        for at in range(0, out.shape[1], BLOCK):  # blocks of pixels that fit into a processor's cache
+        out = torch.empty(len(weights), len(every[0]), dtype=every[0].dtype)
+        weights = weights.to(out.dtype)
+        for at in range(0, out.shape[1], BLOCK):
             factors = _factors(Angles(*(x[at : at + BLOCK] for x in every)), self.low, self.high)
-            out[:, at : at + BLOCK] = weights @ _terms(factors)
-        return out.unflatten(1, shape) * _seeliger(angles)
+            out[:, at : at + BLOCK] = (
+                _sum_of_one(weights[0], factors) if len(weights) == 1 else weights @ _terms(factors)
+            )
+        return out.unflatten(1, shape)
 
 
 def _seeliger(angles: Angles) -> Tensor:
@@ -155,6 +167,33 @@ def _terms(factors: list[list[Tensor]]) -> Tensor:
     for n, factor in enumerate(rough):
         start = len(TERMS) + n * len(SIMPLE)
         torch.mul(out[SIMPLE], factor, out=out[start : start + len(SIMPLE)])
+    return out
+
+
+def _sum_of_one(weights: Tensor, factors: list[list[Tensor]]) -> Tensor:
+    """(N,) the sum of :func:`_terms` weighted by (terms,), one factor taken out after the other."""
+    first, second, third, rough = factors
+    out = _polynomial(weights[: len(TERMS)], DEGREE, TERMS, first, second, third)
+    simple = [TERMS[k] for k in SIMPLE]
+    for n, factor in enumerate(rough):
+        own = weights[len(TERMS) + n * len(SIMPLE) :][: len(SIMPLE)]
+        out.addcmul_(factor, _polynomial(own, ROUGH_DEGREE, simple, first, second, third))
+    return out
+
+
+def _polynomial(
+    weights: Tensor, degree: int, terms: Sequence[Term], first: list[Tensor], second: list[Tensor], third: list[Tensor]
+) -> Tensor:
+    """(N,) sum of products of one of each factors, each product times its weight; terms : (i, j, k) of i + j + k up to the degree"""
+    among = weights.new_zeros((degree + 1,) * 3)
+    among[tuple(zip(*terms, strict=True))] = weights
+    powers = torch.stack(third[: degree + 1])
+    out = torch.zeros_like(first[0])
+    for i in range(degree + 1):
+        row = torch.zeros_like(out)
+        for part, factor in zip(among[i, : degree + 1 - i] @ powers, second, strict=False):
+            row.addcmul_(part, factor)
+        out.addcmul_(row, first[i])
     return out
 
 
