@@ -347,7 +347,7 @@ def test_a_learned_row_that_is_no_better_is_not_praised(scene):
         def coefficients(self, elevation):
             return 0.5 * super().coefficients(elevation)
 
-    for predictor, words in ((Flat(), "shows no difference from"), (Dark(), "% higher than")):
+    for predictor, words in ((Flat(), "shows no sure difference from"), (Dark(), "% higher than")):
         only = ("learned", "global")
         result, *_ = _evaluate(scene, predictor=predictor, only=only)
         assert words in result["conclusions"][0]

@@ -289,7 +289,7 @@ def evaluation_result(low, high):
     [
         (3.0, 20.0, "good", "12.0 % lower than"),
         (-30.0, -2.0, "bad", "12.0 % higher than"),
-        (-1.0, 25.0, "", "shows no difference from"),
+        (-1.0, 25.0, "", "shows no sure difference from"),
         (None, None, "", "cannot be compared with"),
     ],
 )

@@ -46,7 +46,7 @@ def compared(ours: str, other: str, gain: dict[str, Any], on: str) -> Sentence:
     value, word = float(gain["gain_percent"]), verdict(gain)
     tail = f"gain {value:+.1f} % ({bounds(gain)}; {on})"
     if word == "no difference":
-        return f"{ours} shows no difference from {other}: {tail}.", ""
+        return f"{ours} shows no sure difference from {other}: {tail}.", ""
     if word == "unknown":
         return f"{ours} cannot be compared with {other} with any certainty: {tail}.", ""
     if word == "better":
