@@ -14,6 +14,7 @@ from render_scene import LAT, LON, make_grid, smooth_maps, write_svbrdf
 
 from schemas.files.outputs import Output
 from stages import render, view
+from stages.physics.maps.grid import read_grid
 from stages.physics.photometry import evaluate, get_model, model_names
 from stages.render.pictures import read_exr
 
@@ -34,6 +35,8 @@ def make_map(folder, model: str):
     defaults = np.array(list(get_model(model).defaults().values()))
     vary = 1 + 4 * (smooth_maps(rng, (96, 128), len(defaults)) - 0.05)
     coefficients = (defaults[:, None, None] * vary).astype(np.float32)
+    if model == "hapke":
+        coefficients[2] = 0.3  # one number for the whole map
     coefficients[:, 20:30, 40:60] = np.nan
     return write_svbrdf(folder / f"{model}.h5", grid, elevation, coefficients, model)
 
@@ -94,6 +97,7 @@ def test_values_layers_and_the_address(tmp_path):
     with h5py.File(path, "a") as file:
         grid_shape = file["elevation"].shape
         file["coefficient_std"] = np.full((3, *grid_shape), 0.002, np.float32)
+        file["coefficient_std"][:2, :40] = 0.001
         elevation, a = file["elevation"][70, 100], file["coefficients"][0, 70, 100]
     view.run(path, None, page, view.Config(sun_azimuth_deg=100.0, sun_elevation_deg=20.0))
     found = run_in_page(
@@ -118,7 +122,7 @@ def test_values_layers_and_the_address(tmp_path):
     assert float(found["values"]["Latitude"].rstrip("° N")) == pytest.approx(lat, abs=2e-5)
     assert float(found["values"]["Height"].rstrip(" m")) == pytest.approx(elevation, abs=0.1)
     assert float(found["values"]["a"]) == pytest.approx(a, rel=2e-3)
-    assert found["values"]["coefficient std a"] == "0.002"
+    assert found["values"]["coefficient std a"] == "0.002" and "coefficient std c" not in found["values"]
     assert found["turned"] == 1
     assert found["title"] == "coefficient std b" and found["limits"][0] < 0.002 < found["limits"][1]
     assert abs(found["place"]["row"] - 48) <= 1 and abs(found["place"]["col"] - 64) <= 1
@@ -126,6 +130,130 @@ def test_values_layers_and_the_address(tmp_path):
     assert abs(found["near"]["row"] - 48) <= 30 and abs(found["near"]["col"] - 64) <= 8
     assert "azimuth=101.00" in found["address"] and "layer=coefficient_std_b" in found["address"]
     assert found["shown"] == "none" and found["rate"] > 0
+
+
+def test_what_is_the_same_everywhere_is_a_line_and_no_layer(tmp_path):
+    path, page = make_map(tmp_path, "hapke"), tmp_path / "v.html"
+    view.run(path, None, page, view.Config())
+    found = run_in_page(
+        page,
+        """return {line: document.getElementById("constants").textContent,
+          layers: [...document.querySelectorAll("#layers button")].map((b) => b.textContent), values: lunargr.values(70, 100)};""",
+    )
+    varying = [p.name for p in get_model("hapke").parameters if p.name != "c" and p.default]
+    assert "c 0.3" in found["line"] and found["layers"][7:] == varying
+    assert [name for name, _ in found["values"]][9:] == varying
+
+
+def test_the_camera_stays_above_ground_however_it_is_moved(tmp_path):
+    path, page = make_map(tmp_path, "M2"), tmp_path / "v.html"
+    with h5py.File(path) as file:
+        elevation, radius = file["elevation"][...], read_grid(file, path).radius
+    view.run(path, None, page, view.Config())
+    poses = run_in_page(
+        page,
+        """
+        const canvas = document.getElementById("canvas"), poses = [], soon = () => new Promise((done) => setTimeout(done, 100));
+        const pointer = (type, clientX, clientY) => canvas.dispatchEvent(new PointerEvent(type,
+          {clientX, clientY, pointerId: 1, button: 0, buttons: type === "pointerup" ? 0 : 1, bubbles: true}));
+        canvas.setPointerCapture = canvas.releasePointerCapture = () => {};  // of pointers that no hand moves
+        for (const camera of ["0,0,-9000,0,0,0", "300,-200,-50,0,0,0", "90000,0,500,80000,0,0"]) {
+          location.hash = "view=space&camera=" + camera;
+          await soon();
+          poses.push(lunargr.pose());
+        }
+        location.hash = "view=space&camera=100,-2500,1800,0,0,0";
+        await soon();
+        for (let k = 0; k < 30; k++) {  // come near, then down
+          canvas.dispatchEvent(new WheelEvent("wheel", {deltaY: -200, clientX: 300, clientY: 300, bubbles: true}));
+          pointer("pointerdown", 300, 300);
+          pointer("pointermove", 300, 240);
+          pointer("pointerup", 300, 240);
+          poses.push(lunargr.pose());
+        }
+        return poses;
+        """,
+    )
+    assert len({tuple(pose) for pose in poses}) > 20
+    for x, y, z, to_x, to_y, _ in poses:
+        row, col = (round(float(np.clip(v, 0, n - 1))) for v, n in ((47.5 - y / 20, 96), (63.5 + x / 20, 128)))
+        assert np.hypot(np.hypot(x, y), z + radius) - radius > elevation[row, col] + 20  # a pixel at least
+        assert abs(to_x) <= 64.1 * 20 and abs(to_y) <= 48.1 * 20
+
+
+def test_a_link_keeps_what_is_seen(small_artefacts, tmp_path):
+    from test_view import map_of
+
+    page = tmp_path / "v.html"
+    view.run(map_of(small_artefacts["scene"], tmp_path), small_artefacts["pairs"], page, view.Config(photographs=2))
+    states = (
+        {"view": "space", "layer": 5, "auto": False, "limits": [2.5, 30], "azimuth": 123, "elevation": 7, "shadows": False},
+        {"view": "map", "photograph": 1},
+    )  # fmt: skip
+    found = run_in_page(
+        page,
+        f"const states = {json.dumps(states)};"
+        + """
+        const canvas = document.getElementById("canvas"), found = [], soon = (ms) => new Promise((done) => setTimeout(done, ms));
+        const seen = () => [{...lunargr.state}, lunargr.pose()];
+        for (const {photograph, ...state} of states) {
+          if (photograph !== undefined) lunargr.photograph(photograph);
+          lunargr.set(state);
+          for (let k = 0; k < 3; k++) canvas.dispatchEvent(new WheelEvent("wheel", {deltaY: -200, clientX: 200, clientY: 250, bubbles: true}));
+          document.getElementById("link").click();
+          const link = location.hash, before = seen();
+          for (const other of ["view=space&camera=500,-9000,8000,0,0,0", "azimuth=1&elevation=50&view=map&camera=0,0,1"]) {
+            location.hash = other;
+            await soon(150);
+          }
+          const between = seen();
+          location.hash = link;
+          await soon(150);
+          found.push([before, between, seen()]);
+        }
+        return found;
+        """,
+    )
+    for before, between, after in found:
+        assert after[0] == before[0] and after[1] == pytest.approx(before[1], rel=1e-4, abs=0.01)
+        assert between[0] != before[0] and between[1] != before[1]
+
+
+def test_a_number_out_of_range_is_put_back(tmp_path):
+    page = tmp_path / "v.html"
+    view.run(make_map(tmp_path, "M2"), None, page, view.Config())
+    shown = run_in_page(
+        page,
+        """
+        const type = (id, text) => {
+          const field = document.getElementById(id);
+          field.focus();
+          field.value = text;
+          for (const kind of ["input", "change"]) field.dispatchEvent(new Event(kind, {bubbles: true}));
+          return Number(field.value);
+        };
+        lunargr.set({auto: false, limits: [0.1, 0.3]});
+        return [type("elevation", "120"), type("elevation", "-4"), type("elevation", ""), type("azimuth", "400"), type("black", "0.2"),
+          type("black", "0.5"), type("white", ""), ...lunargr.state.limits];
+        """,
+    )
+    assert shown == [90, 0.1, 0.1, 40, 0.2, 0.2, 0.3, 0.2, 0.3]
+
+
+@pytest.mark.parametrize("window", ["900,600", "500,800"])
+def test_the_values_are_beside_or_below_the_picture(tmp_path, window):
+    page = tmp_path / "v.html"
+    view.run(make_map(tmp_path, "M2"), None, page, view.Config())
+    picture, values, filled = run_in_page(
+        page,
+        """const box = (id) => document.getElementById(id).getBoundingClientRect().toJSON(), canvas = document.getElementById("canvas");
+        canvas.dispatchEvent(new PointerEvent("pointermove", {clientX: 200, clientY: 150, bubbles: true}));
+        await new Promise((done) => setTimeout(done, 300));
+        return [box("canvas"), box("values"), document.querySelector("#values dd").textContent];""",
+        flags=(f"--window-size={window}",),
+    )
+    assert values["left"] >= picture["right"] or values["top"] >= picture["bottom"]
+    assert filled.endswith("° E") and values["height"] > 50
 
 
 def test_photographs_match_the_page_under_their_own_sun(small_artefacts, tmp_path):

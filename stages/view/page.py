@@ -23,7 +23,10 @@ LEVELS = 512
 # Of other maps, which no picture is made of: as many as a colour bar has colours.
 OTHER_LEVELS = 256
 PHOTOGRAPH_LEVELS = 1024
-SCRIPTS = ("decode.js", "shadows.js", "relight.js", "terrain.js", "panel.js", "photographs.js", "main.js")
+SCRIPTS = (
+    "decode.js", "ground.js", "shadows.js", "relight.js", "terrain.js", "panel.js", "photographs.js", "address.js", "main.js",
+)  # fmt: skip
+SAME = 1e-6  # relative: what varies less is the same everywhere
 SHADERS = ("common", "lattice", "spread", "visible", "shade", "draw_vertex", "draw")
 COLOURS = ("viridis", "magma", "cividis")
 
@@ -62,14 +65,18 @@ def describe(content: Content, frames: Frames, photographs: Sequence[Photograph]
     fields = []
     for k, layer in enumerate([*content.coefficients, *content.others]):
         good = np.isfinite(layer.values)
+        entry: dict[str, Any] = {"name": layer.name, "title": layer.title, "unit": layer.unit}
+        fields.append(entry)
+        low, high = float(np.min(layer.values[good])), float(np.max(layer.values[good]))
+        if high - low <= SAME * max(abs(low), abs(high)):
+            entry["constant"] = high
+            continue
         levels = LEVELS if k < len(content.coefficients) else OTHER_LEVELS
         packed = pack_map(layer.values, good, spread_step(layer.values, good, levels))
-        entry: dict[str, Any] = {"name": layer.name, "title": layer.title, "unit": layer.unit}
         entry["map"] = blob.add_map(packed)
         # most maps are known where the coefficients are
         if not np.array_equal(good, mapped):
             entry["known"] = blob.add_mask(good)
-        fields.append(entry)
     return {
         "height": grid.height,
         "width": grid.width,

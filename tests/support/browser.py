@@ -91,7 +91,7 @@ def run_in_page(page: Path, script: str, *, timeout: float = 180, flags: tuple[s
         copy.write_text(POLICY.sub("", page.read_text()).replace("</body>", sender + "</body>"))
         profile_flag = f"--user-data-dir={profile}/profile"
         # without a port for debugging, a headless Chromium ends as soon as the page has loaded
-        command = [program, *FLAGS, *flags, WINDOW, profile_flag, "--remote-debugging-port=0", copy.as_uri()]
+        command = [program, *FLAGS, WINDOW, *flags, profile_flag, "--remote-debugging-port=0", copy.as_uri()]
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         try:
             answer = json.loads(answers.get(timeout=timeout), object_hook=_arrays)

@@ -50,9 +50,11 @@ async function unpackPage(head) {
   const elevation = await unpackValues(blob, head.elevation, elevationKnown);
   const mapped = await unpackMask(blob, head.mapped);
   const fields = [];
-  for (const field of head.fields) {
+  for (const [k, field] of head.fields.entries()) {
+    if ("constant" in field) continue;
     const known = field.known ? await unpackMask(blob, field.known) : mapped;
-    fields.push({ ...field, values: await unpackValues(blob, field.map, known) });
+    const coefficient = k < head.count, label = coefficient ? field.name : field.name.replaceAll("_", " ");
+    fields.push({ ...field, coefficient, label, values: await unpackValues(blob, field.map, known) });
   }
   const photographs = [];
   for (const photograph of head.photographs) {

@@ -30,7 +30,7 @@ async function main() {
   document.body.classList.add("able");
   await new Promise((resolve) => setTimeout(resolve, 20));  // let the message show
   const page = await unpackPage(head), relighter = new Relighter(renderer, head, page);
-  Object.assign(state, head.start, readHash(relighter.layers));
+  Object.assign(state, head.start);
   const terrain = new Terrain(renderer, head, page, relighter), app = new App(head, page, relighter, terrain);
   document.body.classList.add("ready");
   app.resize();
@@ -45,16 +45,30 @@ class App {
     this.canvas = terrain.renderer.domElement;
     this.panel = new Panel(head, relighter.layers, this);
     this.photographs = new Photographs(head, page, relighter, this);
-    for (const controls of Object.values(terrain.controls)) controls.addEventListener("change", () => this.ask());
+    for (const controls of Object.values(terrain.controls)) {
+      controls.addEventListener("change", () => (terrain.keep(), this.ask()));
+      controls.addEventListener("end", () => this.sayInAddress());
+    }
     window.addEventListener("resize", () => this.resize());
-    window.addEventListener("hashchange", () => this.change(readHash(relighter.layers), false));
+    window.addEventListener("hashchange", () => this.open());
     this.wirePointer();
-    this.change({}, false);
+    this.panel.values(this.rows());
+    this.open();
+  }
+
+  /** What the address says */
+  open() {
+    const { photograph = null, pose, azimuth, elevation, ...parts } = readAddress(this.relighter.layers, this.page.photographs.length);
+    const sun = Object.entries({ azimuth, elevation }).filter(([, value]) => value !== undefined);
+    if (photograph !== null) this.photograph(photograph, false);  // with its own Sun
+    else this.letGo(), Object.assign(state, Object.fromEntries(sun));
+    this.change(parts, false);
+    if (pose) this.terrain.setPose(pose);
   }
 
   /** Change parts of the state and draw. */
   change(parts, say = true) {
-    if ("layer" in parts && parts.layer !== state.layer) state.auto = true;
+    if ("layer" in parts && parts.layer !== state.layer && !parts.limits) state.auto = true;
     Object.assign(state, parts);
     this.terrain.setView(state.view);
     this.panel.refresh(state);
@@ -70,13 +84,13 @@ class App {
     this.change(parts);
   }
 
-  photograph(k) {
+  photograph(k, say = true) {
     this.stop();
     if (k === null) return this.letGo(), this.change({ photograph: null });
     const p = this.page.photographs[k];
     this.terrain.setOutline(p);
     this.terrain.frame(p.row, p.col, p.height, p.width);
-    this.change({ photograph: k, azimuth: p.azimuth, elevation: p.elevation, view: "map", layer: 0 });
+    this.change({ photograph: k, azimuth: p.azimuth, elevation: p.elevation, view: "map", layer: 0 }, say);
   }
 
   /** The photograph's Sun or camera no longer hold */
@@ -89,7 +103,7 @@ class App {
 
   reset() {
     this.terrain.reset();
-    this.ask();
+    this.change({});
   }
 
   play() {
@@ -125,7 +139,7 @@ class App {
   }
 
   async copyLink(button) {
-    this.sayInAddress();
+    this.sayNow();
     const before = button.textContent;
     try {
       await navigator.clipboard.writeText(location.href);
@@ -138,15 +152,12 @@ class App {
 
   sayInAddress() {
     clearTimeout(this.saying);
-    this.saying = setTimeout(() => {
-      const { azimuth, elevation, layer, view, shadows } = state, name = this.relighter.layers[layer].name;
-      const text = new URLSearchParams({ azimuth: azimuth.toFixed(2), elevation: elevation.toFixed(2), layer: name, view, shadows: shadows ? 1 : 0 });
-      try {
-        history.replaceState(null, "", `#${text}`);
-      } catch {
-        // some browsers do not let a page from a file change its address
-      }
-    }, 200);
+    this.saying = setTimeout(() => this.sayNow(), 200);
+  }
+
+  sayNow() {
+    clearTimeout(this.saying);
+    writeAddress(state, this.relighter.layers, this.terrain.pose());
   }
 
   ask() {
@@ -222,7 +233,7 @@ class App {
     canvas.addEventListener("pointerleave", (event) => {
       if (event.pointerType !== "mouse") return;  // a tap's values stay
       this.pointer = null;
-      this.panel.values([]);
+      this.panel.values(this.rows());
     });
   }
 
@@ -237,7 +248,11 @@ class App {
 
   readPointer() {
     const found = this.terrain.pick(this.pointer.x, this.pointer.y);
-    this.panel.values(found ? pixelRows(this.head, this.page, this.relighter, found.row, found.col) : []);
+    this.panel.values(found ? this.rows(found.row, found.col) : this.rows());
+  }
+
+  rows(row, col) {
+    return pixelRows(this.head, this.page, this.relighter, this.terrain.ground, row, col);
   }
 
   /** For tests and for the curious: the page's own numbers */
@@ -259,7 +274,8 @@ class App {
       },
       photograph: (k) => (this.photograph(k), this.drawNow()),
       pick: (x, y) => this.terrain.pick(x, y),
-      values: (row, col) => pixelRows(this.head, this.page, this.relighter, row, col),
+      values: (row, col) => this.rows(row, col),
+      pose: () => this.terrain.pose(),
       /** Frames per second over some frames, the Sun (or else the camera) turning, each frame waited for */
       rate: (frames, turning = "sun") => {
         const start = performance.now(), context = this.terrain.renderer.getContext(), one = new Uint8Array(4);
@@ -273,24 +289,6 @@ class App {
       },
     };
   }
-}
-
-/** #azimuth=..&elevation=..&layer=..&view=map|space&shadows=0|1 */
-function readHash(layers) {
-  const given = new URLSearchParams(location.hash.slice(1)), parts = {};
-  const number = (name, low, high) => {
-    const value = Number(given.get(name));
-    if (given.has(name) && Number.isFinite(value) && value >= low && value <= high) parts[name] = value;
-  };
-  number("azimuth", -360, 360);
-  number("elevation", 0.1, 90);
-  if (given.has("layer")) {
-    const k = layers.findIndex((layer) => layer.name === given.get("layer"));
-    if (k >= 0) parts.layer = k;
-  }
-  if (["map", "space"].includes(given.get("view"))) parts.view = given.get("view");
-  if (given.has("shadows")) parts.shadows = given.get("shadows") !== "0";
-  return parts;
 }
 
 main().catch((error) => {

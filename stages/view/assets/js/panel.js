@@ -15,9 +15,7 @@ class Panel {
     byId("save").onclick = () => act.save();
     byId("link").onclick = () => act.copyLink(byId("link"));
     byId("auto").onchange = (event) => act.change({ auto: event.target.checked });
-    for (const id of ["black", "white"]) {
-      byId(id).onchange = () => act.change({ auto: false, limits: [Number(byId("black").value), Number(byId("white").value)] });
-    }
+    for (const id of ["black", "white"]) byId(id).onchange = () => this.typedContrast();
     const means = head.factor > 1 ? `, each the mean of ${head.factor} × ${head.factor} of the file's` : "";
     byId("about").textContent = `${head.width} × ${head.height} pixels of ${short(head.gsd)} m${means}. Radiance factor (${head.brightness}), with cos(incidence) in it; negative values are shown as 0. Made by ${document.querySelector("meta[name=generator]").content}.`;
     window.addEventListener("keydown", (event) => this.key(event));
@@ -34,14 +32,24 @@ class Panel {
       drag(event);
     };
     dial.onpointermove = (event) => event.buttons && drag(event);
+    // what was typed goes to the nearest that there is, or back
+    for (const id of ["azimuth", "elevation"]) byId(id).onchange = () => setValue(id, act.state[id], true);
     for (const id of ["azimuth", "azimuth-slider"]) byId(id).oninput = (event) => event.target.value !== "" && act.sun(Number(event.target.value), null);
     for (const id of ["elevation", "elevation-slider"]) byId(id).oninput = (event) => event.target.value !== "" && act.sun(null, Number(event.target.value));
   }
 
+  typedContrast() {
+    const { act } = this, limits = ["black", "white"].map((id) => (byId(id).value === "" ? NaN : Number(byId(id).value)));
+    if (limits[0] < limits[1]) return act.change({ auto: false, limits });
+    this.contrast(act.state.limits, this.layers[act.state.layer].colours, true);
+  }
+
   wireLayers() {
+    const same = this.head.fields.filter((field) => "constant" in field).map((field) => `${field.name} ${short(field.constant)}`);
+    byId("constants").textContent = same.length ? `The same everywhere: ${same.join(", ")}.` : "";
     this.layers.forEach((layer, k) => {
       const button = document.createElement("button");
-      Object.assign(button, { type: "button", textContent: layerName(this.head, layer, k), title: layer.title });
+      Object.assign(button, { type: "button", textContent: layer.label, title: layer.title });
       button.setAttribute("role", "radio");
       button.onclick = () => this.act.change({ layer: k });
       byId("layers").append(button);
@@ -86,7 +94,7 @@ class Panel {
     const layer = this.layers[state.layer];
     [...byId("layers").children].forEach((button, k) => button.setAttribute("aria-checked", k === state.layer));
     for (const button of document.querySelectorAll("[data-view]")) button.setAttribute("aria-checked", button.dataset.view === state.view);
-    byId("layer-title").textContent = layerName(this.head, layer, state.layer);
+    byId("layer-title").textContent = layer.label;
     byId("layer-unit").textContent = layer.unit === "1" ? "" : layer.unit;
     byId("layer-text").textContent = layer.map ? layer.title : "";
     byId("view-text").textContent = state.photograph !== null ? "Light that goes to the photograph's camera." : state.view === "map" ? "Light that goes straight up from every pixel." : "Light that goes to this camera. Drag to turn it, scroll to come near.";
@@ -98,11 +106,12 @@ class Panel {
     byId("needle").setAttribute("transform", `rotate(${this.head.convergence_deg + (turned * 180) / Math.PI})`);
   }
 
-  contrast(limits, colours) {
+  /** typed: put back what the fields hold, also while they are written in */
+  contrast(limits, colours, typed = false) {
     const span = limits[1] - limits[0]; // three digits of the range: below that nobody sees a difference
     const digits = (v) => (span > 1e-9 ? Number(v.toFixed(Math.max(0, 2 - Math.floor(Math.log10(span))))) : Number(v.toPrecision(3))).toString();
     [byId("low").textContent, byId("high").textContent] = limits.map(digits);
-    for (const [id, value] of [["black", limits[0]], ["white", limits[1]]]) if (document.activeElement !== byId(id)) byId(id).value = digits(value);
+    for (const [id, value] of [["black", limits[0]], ["white", limits[1]]]) if (typed || document.activeElement !== byId(id)) byId(id).value = digits(value);
     if (this.barColours === (colours ?? "grey")) return;
     this.barColours = colours ?? "grey";
     const context = byId("colour-bar").querySelector("canvas").getContext("2d"), pixels = context.createImageData(256, 1);
@@ -136,34 +145,28 @@ class Panel {
   }
 }
 
-function layerName(head, layer, k) {
-  const coefficient = k - QUANTITIES.length;
-  if (coefficient < 0) return layer.title;
-  return coefficient < head.count ? layer.name : layer.name.replaceAll("_", " ");
-}
-
-function setValue(id, value) {
-  if (document.activeElement !== byId(id) || byId(id).type === "range") byId(id).value = Math.round(value * 100) / 100;
+function setValue(id, value, typed = false) {
+  if (typed || document.activeElement !== byId(id) || byId(id).type === "range") byId(id).value = Math.round(value * 100) / 100;
 }
 
 const short = (value) => (value !== 0 && Math.abs(value) < 1e-3 ? value.toExponential(2) : Number(value.toPrecision(4)).toString());
 
-/** Rows for the read-out of a pixel */
-function pixelRows(head, page, relighter, row, col) {
-  const k = row * head.width + col, up = upAt(head.axes, head.nodes, row / (head.height - 1), col / (head.width - 1));
-  const [east, north, above] = head.middle, body = [0, 1, 2].map((i) => up[0] * east[i] + up[1] * north[i] + up[2] * above[i]);
-  const lon = (Math.atan2(body[1], body[0]) * 180) / Math.PI, lat = (Math.asin(body[2]) * 180) / Math.PI;
-  const [image, incidence, emission, phase] = relighter.read(row, col, 1, 1), [sunlight, slope] = relighter.read(row, col, 1, 1, 2);
-  const degrees = (v) => `${v.toFixed(1)}°`, known = Number.isFinite(page.elevation[k]);
-  const place = [["Longitude", `${((lon + 360) % 360).toFixed(5)}° E`], ["Latitude", `${Math.abs(lat).toFixed(5)}° ${lat < 0 ? "S" : "N"}`]];
-  if (!known) return [...place, ["Height", "unknown"]];
+/** Rows for the read-out of a pixel; of none, or where nothing is known, dashes */
+function pixelRows(head, page, relighter, ground, row, col) {
+  const here = row !== undefined, k = row * head.width + col, [lon, lat] = here ? ground.lonLat(row, col) : [];
+  const known = here && Number.isFinite(page.elevation[k]), say = (when, text) => (when ? text() : "–");
+  const [image, incidence, emission, phase] = known ? relighter.read(row, col, 1, 1) : [], [sunlight, slope] = known ? relighter.read(row, col, 1, 1, 2) : [];
+  const degrees = (v) => say(known, () => `${v.toFixed(1)}°`);
   return [
-    ...place,
-    ["Height", `${page.elevation[k].toFixed(1)} m`],
-    [head.brightness, image < 0 ? "unknown" : image.toFixed(5)],
-    ["i, e, g", [incidence, emission, phase].map(degrees).join(", ")],
+    ["Longitude", say(here, () => `${lon.toFixed(5)}° E`)],
+    ["Latitude", say(here, () => `${Math.abs(lat).toFixed(5)}° ${lat < 0 ? "S" : "N"}`)],
+    ["Height", say(known, () => `${page.elevation[k].toFixed(1)} m`)],
+    [head.brightness, say(image >= 0, () => image.toFixed(5))],
+    ["Incidence", degrees(incidence)],
+    ["Emission", degrees(emission)],
+    ["Phase", degrees(phase)],
     ["Slope", degrees(slope)],
-    ["Sunlight", `${(100 * sunlight).toFixed(0)} %`],
-    ...page.fields.map((f) => [f.name.replaceAll("_", " "), Number.isFinite(f.values[k]) ? short(f.values[k]) : "unknown"]),
+    ["Sunlight", say(known, () => `${(100 * sunlight).toFixed(0)} %`)],
+    ...page.fields.map((f) => [f.label, say(here && Number.isFinite(f.values[k]), () => short(f.values[k]))]),
   ];
 }

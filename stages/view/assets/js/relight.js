@@ -1,13 +1,13 @@
 // The map under one Sun: from heights and coefficients to I/F and angles, on the map's own pixels.
 
 const QUANTITIES = [
-  { name: "image", title: "Image" },  // in the map's own brightness
-  { name: "sunlight", title: "Sunlight", unit: "share of the Sun that is seen" },
-  { name: "incidence", title: "Incidence", unit: "deg", colours: "cividis" },
-  { name: "emission", title: "Emission", unit: "deg", colours: "cividis" },
-  { name: "phase", title: "Phase", unit: "deg", colours: "cividis" },
-  { name: "slope", title: "Slope", unit: "deg", colours: "cividis" },
-  { name: "elevation", title: "Height", unit: "m", colours: "viridis" },
+  { name: "image", label: "Image" },  // in the map's own brightness
+  { name: "sunlight", label: "Sunlight", unit: "share of the Sun that is seen" },
+  { name: "incidence", label: "Incidence", unit: "deg", colours: "cividis" },
+  { name: "emission", label: "Emission", unit: "deg", colours: "cividis" },
+  { name: "phase", label: "Phase", unit: "deg", colours: "cividis" },
+  { name: "slope", label: "Slope", unit: "deg", colours: "cividis" },
+  { name: "elevation", label: "Height", unit: "m", colours: "viridis" },
 ];
 const NOTHING = -1e30;
 
@@ -49,14 +49,14 @@ class Relighter {
     const [low, high] = range(page.elevation);
     this.base = (low + high) / 2;
     this.relief = high - low;
-    this.layers = [{ ...QUANTITIES[0], unit: head.brightness }, ...QUANTITIES.slice(1), ...page.fields.map((f, k) => ({ ...f, colours: k < head.count ? "viridis" : "magma" }))];
+    this.layers = [{ ...QUANTITIES[0], unit: head.brightness }, ...QUANTITIES.slice(1), ...page.fields.map((f) => ({ ...f, colours: f.coefficient ? "viridis" : "magma" }))];
     const heights = Float32Array.from(page.elevation, (z) => (Number.isFinite(z) ? z - this.base : NOTHING));
-    const fields = this.fieldTexture();
+    const fields = this.fieldTexture(), mapped = texture(page.mapped, head.width, head.height, THREE.RedFormat, THREE.UnsignedByteType);
     const shared = {
       heights: texture(heights, head.width, head.height, THREE.RedFormat, THREE.FloatType),
       size: new THREE.Vector2(head.width, head.height),
     };
-    this.passes = new Passes(renderer, sources(head, page.fields.length), shared);
+    this.passes = new Passes(renderer, sources(head, page.fields), shared);
     this.shadows = new Shadows(renderer, this.passes, head, this.relief);
     this.shown = target(head.width, head.height, THREE.RGFormat, THREE.HalfFloatType, {
       generateMipmaps: true,
@@ -64,12 +64,12 @@ class Relighter {
       magFilter: THREE.LinearFilter,
       anisotropy: renderer.capabilities.getMaxAnisotropy(),
     });
-    this.fixed = { fields, frames: this.frameTexture(), base: this.base, radius: head.radius, scales: this.scales };
+    this.fixed = { fields, mapped, frames: this.frameTexture(), base: this.base, radius: head.radius, scales: this.scales };
   }
 
   /** Coefficients and other maps as half floats about their median, which keeps them finer than they were packed. */
   fieldTexture() {
-    const { head, page } = this, pixels = head.width * head.height, data = new Uint16Array(pixels * page.fields.length);
+    const { head, page } = this, pixels = head.width * head.height, count = Math.max(1, page.fields.length), data = new Uint16Array(pixels * count);
     const missing = THREE.DataUtils.toHalfFloat(65504);
     this.scales = page.fields.map((field, k) => {
       const [first, middle, last] = percentiles(field.values, [0.01, 0.5, 0.99]);
@@ -80,7 +80,8 @@ class Relighter {
       }
       return new THREE.Vector2(middle, scale);
     });
-    const array = new THREE.DataArrayTexture(data, head.width, head.height, page.fields.length);
+    if (!this.scales.length) this.scales.push(new THREE.Vector2(0, 1));  // a shader has no empty list
+    const array = new THREE.DataArrayTexture(data, head.width, head.height, count);
     return Object.assign(array, { format: THREE.RedFormat, type: THREE.HalfFloatType, unpackAlignment: 2, needsUpdate: true });
   }
 
@@ -150,15 +151,23 @@ class Relighter {
 }
 
 function sources(head, fields) {
-  const { shaders } = head, constants = `#define COUNT ${head.count}\n#define FIELDS ${fields}\n#define NODES ${head.nodes}\n`;
+  const { shaders } = head, constants = `#define COUNT ${head.count}\n#define FIELDS ${Math.max(1, fields.length)}\n#define NODES ${head.nodes}\n`;
   const first = `#define FIRST_FIELD ${QUANTITIES.length}\n`;
   return {
     spread: shaders.common + shaders.lattice + shaders.spread,
     visible: shaders.common + shaders.lattice + shaders.visible,
-    shade: constants + first + shaders.common + shaders.shade.replace("//MODEL", () => shaders.model),
+    shade: constants + first + shaders.common + shaders.shade.replace("//MODEL", () => shaders.model).replace("//COEFFICIENTS", () => coefficients(head, fields)),
     sample: `precision highp float; uniform sampler2D layer; out vec4 result;
       void main() { vec2 v = textureLod(layer, gl_FragCoord.xy / 96.0, 0.0).rg; result = vec4(v, 0.0, 1.0); }`,
   };
+}
+
+/** The model's coefficients at a place: from maps, or the same everywhere */
+function coefficients(head, fields) {
+  return head.fields.slice(0, head.count).map((given, k) => {
+    const slot = fields.findIndex((field) => field.name === given.name);
+    return slot < 0 ? `p[${k}] = ${given.constant.toExponential(9)};` : `known = field(place, ${slot}, p[${k}]) && known;`;
+  }).join("\n  ");
 }
 
 function texture(data, width, height, format, type) {

@@ -5,6 +5,9 @@ const MESH_PX = 512;  // vertices along the longer side
 class Terrain {
   constructor(renderer, head, page, relighter) {
     Object.assign(this, { renderer, head, page, relighter });
+    this.ground = new Ground(head, page, relighter.base);
+    this.step = Math.max(1, Math.ceil(Math.max(head.width, head.height) / MESH_PX));
+    this.clearance = 3 * this.step * head.gsd;  // m of the camera above ground: more than the mesh smooths away
     this.scale = 2 / (Math.max(head.height, head.width) * head.gsd);  // scene units per m
     this.material = new THREE.RawShaderMaterial({
       glslVersion: THREE.GLSL3,
@@ -24,19 +27,21 @@ class Terrain {
       premultipliedAlpha: true,
     });
     this.scenes = { map: scene(this.flat(), this.material), space: scene(this.relief(), this.material) };
-    this.cameras = { map: new THREE.OrthographicCamera(-1, 1, 1, -1, -100, 100), space: new THREE.PerspectiveCamera(30, 1, 0.005, 50) };
+    this.cameras = { map: new THREE.OrthographicCamera(-1, 1, 1, -1, -100, 100), space: new THREE.PerspectiveCamera(30, 1, (this.clearance * this.scale) / 4, 50) };
     this.controls = {};
     const element = renderer.domElement;
     for (const view of ["map", "space"]) {
       this.cameras[view].up.set(0, view === "map" ? 1 : 0, view === "map" ? 0 : 1);
       const controls = (this.controls[view] = new THREE.OrbitControls(this.cameras[view], element));
-      Object.assign(controls, { enableDamping: false, enabled: false, zoomToCursor: true });
+      Object.assign(controls, { enableDamping: false, enabled: false, zoomToCursor: true, screenSpacePanning: view === "map" });
     }
     this.controls.map.enableRotate = false;
     this.controls.map.mouseButtons = { LEFT: 2, MIDDLE: 1, RIGHT: 2 };
     this.controls.map.touches = { ONE: 1, TWO: 2 };
     this.controls.space.maxPolarAngle = Math.PI / 2 - 0.02;
+    this.controls.space.minDistance = 4 * this.clearance * this.scale;
     this.controls.space.maxDistance = 12;
+    this.controls.space.addEventListener("start", () => this.aim());
     this.controls.map.minZoom = 0.5;
     this.controls.map.maxZoom = Math.max(head.height, head.width) / 8;
     this.pixel = target(1, 1, THREE.RGBAFormat, THREE.FloatType, { depthBuffer: true });
@@ -63,6 +68,48 @@ class Terrain {
     }
     camera.updateProjectionMatrix();
     controls.update();
+  }
+
+  /** What the camera looks at stays on the map, and the camera above ground. */
+  keep() {
+    const camera = this.cameras[this.view], { target } = this.controls[this.view], { head, ground } = this;
+    const x = head.width / Math.max(head.width, head.height), y = head.height / Math.max(head.width, head.height), before = target.clone();
+    target.clamp(new THREE.Vector3(-x, -y, -Infinity), new THREE.Vector3(x, y, Infinity));
+    camera.position.add(target).sub(before);
+    if (this.view === "map") return;
+    const place = this.cameraPlace(), { row, col } = ground.place(place), lowest = ground.point(row, col, ground.height(row, col) + this.clearance);
+    const up = place.clone().setZ(place.z + head.radius), missing = lowest.setZ(lowest.z + head.radius).length() - up.length();
+    if (missing > 0) camera.position.addScaledVector(up.normalize(), missing * this.scale);
+    camera.lookAt(target);
+  }
+
+  /** The camera turns about, and comes near to, the ground in the middle of the picture. */
+  aim() {
+    const { target } = this.controls.space, place = this.cameraPlace(), direction = target.clone().divideScalar(this.scale).sub(place);
+    const found = this.ground.hit(place, direction, 2 * direction.length());
+    if (found) target.copy(found.multiplyScalar(this.scale));
+  }
+
+  /** The camera as a few numbers in m: what it looks at and its zoom, or where it stands and what it looks at */
+  pose() {
+    const camera = this.cameras[this.view], { target } = this.controls[this.view], metres = (v) => v.toArray().map((c) => c / this.scale);
+    return this.view === "map" ? [...metres(target).slice(0, 2), camera.zoom] : [...metres(camera.position), ...metres(target)];
+  }
+
+  /** Take up what pose() gave in this view. */
+  setPose(numbers) {
+    const camera = this.cameras[this.view], controls = this.controls[this.view], n = numbers.map((v) => v * this.scale);
+    if (this.view === "map") {
+      controls.target.set(n[0], n[1], 0);
+      camera.position.set(n[0], n[1], 10);
+      camera.zoom = numbers[2];
+    } else {
+      camera.position.set(...n.slice(0, 3));
+      controls.target.set(...n.slice(3));
+    }
+    camera.updateProjectionMatrix();
+    controls.update();
+    this.keep();
   }
 
   /** Look at a window of the map from above. */
@@ -138,8 +185,7 @@ class Terrain {
 
   /** The terrain as a mesh in the axes of the map's middle, body curvature included; holes stay open. */
   relief() {
-    const { head, page, relighter } = this, { width, height, radius, nodes, axes } = head;
-    const step = Math.max(1, Math.ceil(Math.max(width, height) / MESH_PX));
+    const { page, relighter, ground, step } = this, { width, height } = this.head;
     const columns = lattice(width, step), rows = lattice(height, step), count = columns.length * rows.length;
     const positions = new Float32Array(3 * count), uvs = new Float32Array(2 * count), known = new Uint8Array(count);
     this.middleHeight = relighter.base;
@@ -147,10 +193,7 @@ class Terrain {
       for (let i = 0; i < columns.length; i++, k++) {
         const z = meanAround(page.elevation, width, height, rows[j], columns[i], step);
         known[k] = Number.isFinite(z) ? 1 : 0;
-        const up = upAt(axes, nodes, rows[j] / (height - 1), columns[i] / (width - 1)), r = radius + (known[k] ? z : relighter.base);
-        positions[3 * k] = r * up[0] * this.scale;
-        positions[3 * k + 1] = r * up[1] * this.scale;
-        positions[3 * k + 2] = (r * up[2] - radius) * this.scale;
+        ground.point(rows[j], columns[i], known[k] ? z : relighter.base).multiplyScalar(this.scale).toArray(positions, 3 * k);
         uvs[2 * k] = (columns[i] + 0.5) / width;
         uvs[2 * k + 1] = (rows[j] + 0.5) / height;
       }
@@ -196,15 +239,6 @@ function meanAround(values, width, height, row, col, step) {
     }
   }
   return count ? sum / count : NaN;
-}
-
-/** Unit vector up at shares of the map's height and width, interpolated between nodes */
-function upAt(axes, nodes, down, across) {
-  const v = down * (nodes - 1), u = across * (nodes - 1), j = Math.min(nodes - 2, Math.floor(v)), i = Math.min(nodes - 2, Math.floor(u));
-  const at = (row, col, k) => axes[9 * (row * nodes + col) + 6 + k], f = u - i, g = v - j;
-  const up = [0, 1, 2].map((k) => (1 - g) * ((1 - f) * at(j, i, k) + f * at(j, i + 1, k)) + g * ((1 - f) * at(j + 1, i, k) + f * at(j + 1, i + 1, k)));
-  const length = Math.hypot(...up);
-  return up.map((c) => c / length);
 }
 
 function colourTable(colours) {

@@ -1,5 +1,6 @@
 // What is shown, on the map's own pixels: I/F by the model's formula, angles, terrain or one of the maps.
-uniform sampler2DArray fields;   // coefficients, then the other maps, as (value - offset) / scale
+uniform sampler2DArray fields;   // coefficients that vary, then the other maps, as (value - offset) / scale
+uniform sampler2D mapped;        // 1: every coefficient is known
 uniform vec2 scales[FIELDS];     // offset, scale
 uniform sampler2D frames;        // local axes and pixel sizes at the nodes
 uniform sampler2D sunlight;      // the Sun's visible share
@@ -59,9 +60,9 @@ void main() {
   float mu0 = dot(normal, sun), mu = dot(normal, view), cos_g = clamp(dot(sun, view), -1.0, 1.0);
   float visible = shadows ? texelFetch(sunlight, place, 0).r : 1.0;
 
-  bool known = is_known(here);
+  bool known = is_known(here) && texelFetch(mapped, place, 0).r > 0.0;
   float p[COUNT];
-  for (int k = 0; k < COUNT; k++) known = field(place, k, p[k]) && known;
+  //COEFFICIENTS
   float image = 0.0;
   if (known && mu0 > 1e-7 && mu > 1e-7) image = max(radiance_factor(p, mu0, mu, cos_g) * visible, 0.0);
   vec4 angles = degrees(vec4(acos(clamp(mu0, -1.0, 1.0)), acos(clamp(mu, -1.0, 1.0)), acos(cos_g), atan(length(slopes))));
