@@ -181,6 +181,49 @@ def test_the_camera_stays_above_ground_however_it_is_moved(tmp_path):
         assert abs(to_x) <= 64.1 * 20 and abs(to_y) <= 48.1 * 20
 
 
+def test_a_coarse_picture_while_the_sun_is_dragged_and_the_whole_one_after(tmp_path):
+    rng, page = np.random.default_rng(3), tmp_path / "v.html"
+    grid, elevation = make_grid(1024, 1024, 5.0), hills(rng, 1024, 5.0)
+    coefficients = np.stack([0.03 + 0.3 * smooth_maps(rng, (1024, 1024), 1)[0], *np.full((2, 1024, 1024), 0.02)])
+    view.run(write_svbrdf(tmp_path / "m.h5", grid, elevation, coefficients, "M2"), None, page, view.Config())
+    found = run_in_page(
+        page,
+        """
+        const canvas = document.getElementById("canvas"), counts = [{...lunargr.frames}], soon = () => new Promise((done) => setTimeout(done, 100));
+        const pointer = (type, clientX) => canvas.dispatchEvent(new PointerEvent(type,
+          {clientX, clientY: 300, pointerId: 1, shiftKey: true, buttons: type === "pointerup" ? 0 : 1, bubbles: true}));
+        canvas.setPointerCapture = () => {};  // of a pointer that no hand moves
+        pointer("pointerdown", 200);
+        for (let x = 200; x < 280; x += 10, await soon()) pointer("pointermove", x);
+        for (let k = 0; k < 6; k++) await soon();
+        counts.push({...lunargr.frames});
+        pointer("pointerup", 280);
+        for (let k = 0; k < 100 && lunargr.frames.whole === counts[1].whole; k++) await soon();
+        counts.push({...lunargr.frames});
+        const small = document.createElement("canvas").getContext("2d", {willReadFrequently: true});
+        const grey = () => {
+          small.drawImage(canvas, 0, 0, 64, 64);
+          return Float32Array.from(small.getImageData(0, 0, 64, 64).data.filter((_, k) => k % 4 === 0));
+        };
+        lunargr.set({auto: false, limits: [0, 0.2], azimuth: 270});
+        const pictures = [];
+        for (const view of ["map", "space"]) {
+          lunargr.set({view});
+          lunargr.rate(1, "sun", true);
+          pictures.push(grey());
+          lunargr.set({});
+          pictures.push(grey());
+        }
+        return {counts, pictures};
+        """,
+    )
+    before, dragged, after = found["counts"]
+    assert dragged["coarse"] > before["coarse"] and dragged["whole"] == before["whole"] < after["whole"]
+    for coarse, whole in zip(found["pictures"][::2], found["pictures"][1::2], strict=True):
+        assert 0 < np.abs(coarse - whole).mean() < 0.05 * whole.std() + 2
+        assert np.corrcoef(coarse, whole)[0, 1] > 0.97
+
+
 def test_a_link_keeps_what_is_seen(small_artefacts, tmp_path):
     from test_view import map_of
 

@@ -24,7 +24,8 @@ LEVELS = 512
 OTHER_LEVELS = 256
 PHOTOGRAPH_LEVELS = 1024
 SCRIPTS = (
-    "decode.js", "ground.js", "shadows.js", "relight.js", "terrain.js", "panel.js", "photographs.js", "address.js", "main.js",
+    "decode.js", "ground.js", "coarse.js", "shadows.js", "relight.js", "terrain.js", "panel.js", "photographs.js", "address.js",
+    "main.js",
 )  # fmt: skip
 SAME = 1e-6  # relative: what varies less is the same everywhere
 SHADERS = ("common", "lattice", "spread", "visible", "shade", "draw_vertex", "draw")

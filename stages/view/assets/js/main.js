@@ -1,5 +1,7 @@
 // The page's state, what changes it, and the one loop that draws it.
 
+const SLOW_MS = 100, STILL_MS = 250;
+
 const state = { azimuth: 0, elevation: 0, shadows: true, layer: 0, view: "map", auto: true, limits: [0, 1], photograph: null };
 
 /** The Sun's direction in the axes of the map's middle */
@@ -34,6 +36,8 @@ async function main() {
   const terrain = new Terrain(renderer, head, page, relighter), app = new App(head, page, relighter, terrain);
   document.body.classList.add("ready");
   app.resize();
+  relighter.setLight(app.light());
+  relighter.read(0, 0, 1, 1);  // shaders are made now: how long a picture takes is measured next
   app.drawNow();
   window.lunargr = { able: true, state, head, ...app.hooks() };
   document.documentElement.dataset.lunargr = "ready";
@@ -41,7 +45,7 @@ async function main() {
 
 class App {
   constructor(head, page, relighter, terrain) {
-    Object.assign(this, { head, page, relighter, terrain, state, dirty: false, playing: false });
+    Object.assign(this, { head, page, relighter, terrain, state, dirty: false, playing: false, frames: { whole: 0, coarse: 0 } });
     this.canvas = terrain.renderer.domElement;
     this.panel = new Panel(head, relighter.layers, this);
     this.photographs = new Photographs(head, page, relighter, this);
@@ -50,6 +54,7 @@ class App {
       controls.addEventListener("end", () => this.sayInAddress());
     }
     window.addEventListener("resize", () => this.resize());
+    for (const kind of ["pointerdown", "pointerup", "pointercancel"]) window.addEventListener(kind, (event) => (this.pressed = event.buttons > 0), true);
     window.addEventListener("hashchange", () => this.open());
     this.wirePointer();
     this.panel.values(this.rows());
@@ -160,10 +165,15 @@ class App {
     writeAddress(state, this.relighter.layers, this.terrain.pose());
   }
 
+  /** Draw soon. Where a picture takes long, a coarse one comes first, and the whole one once nothing moves. */
   ask() {
     if (this.dirty) return;
     this.dirty = true;
-    requestAnimationFrame(() => this.drawNow());
+    requestAnimationFrame(() => this.drawNow(this.slow && this.key() !== this.drawn));
+  }
+
+  refineSoon() {
+    this.finer = setTimeout(() => (this.pressed ? this.refineSoon() : this.drawNow()), STILL_MS);
   }
 
   /** The light as the state says; where the light goes to follows the view */
@@ -172,21 +182,36 @@ class App {
     return { sun: sunVector(this.head, state.azimuth, state.elevation), shadows: state.shadows, camera };
   }
 
-  drawNow() {
+  /** All that the map's pixels hang on; else only its place on the screen changes */
+  key() {
+    const { sun, shadows, camera } = this.light(), moves = this.relighter.layers[state.layer].camera;
+    return JSON.stringify([sun, shadows, state.layer, moves && camera]);
+  }
+
+  drawNow(coarse = false) {
     this.dirty = false;
-    const { relighter, terrain } = this, layer = relighter.layers[state.layer], span = this.span(layer);
-    const light = this.light(), key = JSON.stringify([light, state.layer]);
-    if (key !== this.drawn) {  // else only the map's place on the screen has changed
-      relighter.setLight(light);
+    clearTimeout(this.finer);
+    if (coarse) this.refineSoon();
+    const { terrain } = this, relighter = coarse ? (this.coarse ??= new Relighter(terrain.renderer, ...coarseMap(this.head, this.page), true)) : this.relighter;
+    const layer = this.relighter.layers[state.layer], span = this.span(layer), key = this.key(), start = performance.now();
+    relighter.setLight(this.light());
+    if (key !== this.drawn) {
       relighter.show(state.layer, span);
       this.found = relighter.contrast(state.layer, span);
+      this.frames[coarse ? "coarse" : "whole"]++;
     }
-    this.drawn = key;
     if (state.auto) state.limits = this.found;
-    terrain.draw(span, layer.colours, state.limits);
+    terrain.draw(relighter.shown.texture, span, layer.colours, state.limits, coarse);
+    if (coarse) this.drawn = null;
+    else if (key !== this.drawn) {
+      this.drawn = key;
+      terrain.wait();
+      this.slow = performance.now() - start > SLOW_MS;
+    }
     this.panel.contrast(state.limits, layer.colours);
     this.panel.scaleBar(terrain.unitsPerPixel());
     this.panel.needle(state.view === "space" ? terrain.controls.space.getAzimuthalAngle() : 0);
+    if (coarse) return;
     const compared = `${state.photograph} ${state.shadows}`;
     if (compared !== this.compared) this.photographs.refresh(state.photograph);
     this.compared = compared;
@@ -247,6 +272,7 @@ class App {
   }
 
   readPointer() {
+    if (this.drawn === null) return;  // a coarse picture holds no values
     const found = this.terrain.pick(this.pointer.x, this.pointer.y);
     this.panel.values(found ? this.rows(found.row, found.col) : this.rows());
   }
@@ -276,14 +302,15 @@ class App {
       pick: (x, y) => this.terrain.pick(x, y),
       values: (row, col) => this.rows(row, col),
       pose: () => this.terrain.pose(),
+      frames: this.frames,
       /** Frames per second over some frames, the Sun (or else the camera) turning, each frame waited for */
-      rate: (frames, turning = "sun") => {
-        const start = performance.now(), context = this.terrain.renderer.getContext(), one = new Uint8Array(4);
+      rate: (frames, turning = "sun", coarse = false) => {
+        const start = performance.now();
         for (let k = 0; k < frames; k++) {
           if (turning === "sun") state.azimuth = (state.azimuth + 2) % 360;
           else this.terrain.cameras.space.position.x += 0.01;
-          this.drawNow();
-          context.readPixels(0, 0, 1, 1, context.RGBA, context.UNSIGNED_BYTE, one);
+          this.drawNow(coarse);
+          this.terrain.wait();
         }
         return (1000 * frames) / (performance.now() - start);
       },

@@ -1,11 +1,11 @@
 // The map under one Sun: from heights and coefficients to I/F and angles, on the map's own pixels.
 
 const QUANTITIES = [
-  { name: "image", label: "Image" },  // in the map's own brightness
+  { name: "image", label: "Image", camera: true },  // in the map's own brightness; camera: hangs on where the camera is
   { name: "sunlight", label: "Sunlight", unit: "share of the Sun that is seen" },
   { name: "incidence", label: "Incidence", unit: "deg", colours: "cividis" },
-  { name: "emission", label: "Emission", unit: "deg", colours: "cividis" },
-  { name: "phase", label: "Phase", unit: "deg", colours: "cividis" },
+  { name: "emission", label: "Emission", camera: true, unit: "deg", colours: "cividis" },
+  { name: "phase", label: "Phase", camera: true, unit: "deg", colours: "cividis" },
   { name: "slope", label: "Slope", unit: "deg", colours: "cividis" },
   { name: "elevation", label: "Height", unit: "m", colours: "viridis" },
 ];
@@ -44,7 +44,8 @@ class Passes {
 }
 
 class Relighter {
-  constructor(renderer, head, page) {
+  /** coarse: drawn fast rather than sharp */
+  constructor(renderer, head, page, coarse = false) {
     Object.assign(this, { renderer, head, page });
     const [low, high] = range(page.elevation);
     this.base = (low + high) / 2;
@@ -62,7 +63,7 @@ class Relighter {
       generateMipmaps: true,
       minFilter: THREE.LinearMipmapLinearFilter,
       magFilter: THREE.LinearFilter,
-      anisotropy: renderer.capabilities.getMaxAnisotropy(),
+      anisotropy: coarse ? 1 : renderer.capabilities.getMaxAnisotropy(),
     });
     this.fixed = { fields, mapped, frames: this.frameTexture(), base: this.base, radius: head.radius, scales: this.scales };
   }

@@ -26,7 +26,8 @@ class Terrain {
       transparent: true,
       premultipliedAlpha: true,
     });
-    this.scenes = { map: scene(this.flat(), this.material), space: scene(this.relief(), this.material) };
+    this.scenes = { map: scene(this.flat(), this.material), space: scene(this.relief(this.step), this.material) };
+    this.coarse = { ...this.scenes, space: scene(this.relief(8 * this.step), this.material) };
     this.cameras = { map: new THREE.OrthographicCamera(-1, 1, 1, -1, -100, 100), space: new THREE.PerspectiveCamera(30, 1, (this.clearance * this.scale) / 4, 50) };
     this.controls = {};
     const element = renderer.domElement;
@@ -144,12 +145,20 @@ class Terrain {
     return (camera.right - camera.left) / camera.zoom / this.renderer.domElement.clientWidth;
   }
 
-  draw(span, colours, limits) {
+  /** layer: the texture that shows it; coarse: with fewer facets */
+  draw(layer, span, colours, limits, coarse) {
     const { uniforms } = this.material, names = Object.keys(this.head.colours);
     uniforms.colour_row.value = colours ? (names.indexOf(colours) + 0.5) / names.length : -1;
     uniforms.limits.value.set((limits[0] - span[0]) / (span[1] - span[0]), (limits[1] - span[0]) / (span[1] - span[0]));
+    uniforms.layer.value = layer;
     uniforms.picking.value = false;
-    this.renderer.render(this.scenes[this.view], this.cameras[this.view]);
+    this.renderer.render((coarse ? this.coarse : this.scenes)[this.view], this.cameras[this.view]);
+  }
+
+  /** Until what was asked for is drawn */
+  wait() {
+    const context = this.renderer.getContext();
+    context.readPixels(0, 0, 1, 1, context.RGBA, context.UNSIGNED_BYTE, new Uint8Array(4));
   }
 
   setOutline(photograph) {
@@ -184,8 +193,8 @@ class Terrain {
   }
 
   /** The terrain as a mesh in the axes of the map's middle, body curvature included; holes stay open. */
-  relief() {
-    const { page, relighter, ground, step } = this, { width, height } = this.head;
+  relief(step) {
+    const { page, relighter, ground } = this, { width, height } = this.head;
     const columns = lattice(width, step), rows = lattice(height, step), count = columns.length * rows.length;
     const positions = new Float32Array(3 * count), uvs = new Float32Array(2 * count), known = new Uint8Array(count);
     this.middleHeight = relighter.base;
