@@ -11,7 +11,6 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import cv2
 import numpy as np
 
 from stages.common.arrays import Floats32
@@ -25,17 +24,16 @@ from stages.photographs.prior import terrain_variance
 from stages.physics.images.windows import WINDOW_PX, choose_windows
 from stages.physics.maps.window import Box, Window
 from stages.physics.terrain.surface import SHADOWED
+from stages.refine.fit import fit, variances
 from stages.refine.learn import SEED, learn
 from stages.refine.patch import Noise, Patch
-from stages.refine.solve import Posterior, Priors, unresolved
-from stages.refine.spectrum import WAVELENGTHS, Spectrum
+from stages.refine.solve import FIELDS, Priors
+from stages.refine.spectrum import WAVELENGTHS, Spectrum, by_wavelength, waves
 
 WINDOWS = 16
 MARGIN_PX = 16  # around windows: read, and not judged
 FOLDS = 4
-ROUNDS = 3
 ENOUGH = 8  # windows; where there are fewer, their quarters are the units of ground
-SMOOTHED_PX = 4.0  # over which the squares of draws are averaged
 THINNED = 5
 SLOPE, FLAT_PX = (
     0.05,
@@ -58,7 +56,7 @@ class Learned:
 
     def as_text(self) -> dict[str, Any]:
         """What JSON holds of it."""
-        spectra = {k: getattr(self.priors, k).variance.tolist() for k in ("heights", "albedo", "trust")}
+        spectra = {k: getattr(self.priors, k).variance.tolist() for k in ("heights", "albedo", "trust", "widening")}
         noise = {"absolute": self.noise.absolute.tolist(), "relative": self.noise.relative.tolist()}
         return {
             "calibration": self.calibration.as_text(), "spectra": spectra, "noise": noise,
@@ -90,6 +88,38 @@ class Scores:
     image: list[Any]
 
 
+@dataclass(frozen=True)
+class Turn:
+    """Waves (2, H, W) of what the images found without some, of a draw about it, and of what noise alone did to it."""
+
+    found: Floats32
+    draw: Floats32
+    noise: Floats32
+
+
+class Turns:
+    """How much more what images find differs with the choice of images than their noise says: the jackknife (Tukey 1958) by wavelength."""
+
+    def __init__(self) -> None:
+        self._more, self._drawn = np.zeros((2, FIELDS, len(WAVELENGTHS)))
+
+    def add(self, turns: Sequence[Turn]) -> None:
+        """Count one window's."""
+        count = len(turns)
+        if count < 2:
+            return
+        mean = np.mean([turn.found for turn in turns], axis=0)
+        for turn in turns:
+            for k in range(FIELDS):
+                more = (turn.found[k] - mean[k]) ** 2 - turn.noise[k] ** 2 / count
+                self._more[k] += by_wavelength(more) * (count - 1) / count
+                self._drawn[k] += by_wavelength(turn.draw[k] ** 2) / count
+
+    def widening(self) -> Spectrum:
+        """(2, K) factors of the variances of heights and log albedo."""
+        return Spectrum(1 + np.maximum(self._more, 0) / np.maximum(self._drawn, 1e-30))
+
+
 def find_out(ground: Ground, form: str | None, progress: Progress = show_nothing) -> Learned:
     """Calibration, spectra, noise and gain of a map's photographs. form : of displacement, as in ``Ground.calibrate``"""
     calibration = ground.calibrate(form, progress)
@@ -98,13 +128,16 @@ def find_out(ground: Ground, form: str | None, progress: Progress = show_nothing
     boxes = [Window(*box).padded(MARGIN_PX, shape) for box in windows]
     patches = [Patch(ground, calibration, box) for box in boxes]
     priors, noise, _ = learn(patches, *_start(patches, calibration), progress)
-    scores = Scores([], [], [], [], [], [])
+    scores, turns = Scores([], [], [], [], [], []), Turns()
     folds = min(FOLDS, count)
     for number, (patch, window) in enumerate(zip(patches, windows, strict=True)):
+        found = []
         for fold in range(folds if count > 1 else 0):
             progress(number * folds + fold, len(windows) * folds, "images left out")
             left = {k for k in range(count) if k % folds == fold}
-            _score(scores, ground, calibration, patch, window, (priors, noise), left)
+            found += _score(scores, ground, calibration, patch, window, (priors, noise), left)
+        turns.add(found)
+    priors = replace(priors, widening=turns.widening())
     gain, reason = _decide(scores, len(windows), count)
     return Learned(_with_intervals(calibration, scores), priors, noise, gain, reason)
 
@@ -122,26 +155,22 @@ def _start(patches: Sequence[Patch], calibration: Calibration) -> tuple[Priors, 
 def _score(
     scores: Scores, ground: Ground, calibration: Calibration, patch: Patch, window: Box,
     learned: tuple[Priors, Noise], left: Collection[int],
-) -> None:  # fmt: skip
-    """Count the images ``left`` out of one window, as the others predict them."""
+) -> list[Turn]:  # fmt: skip
+    """Count the images ``left`` out of one window, as the others predict them; what these find, if any are left."""
     used = [p.k for p in patch.photographs if p.k not in left]
     tested = [p for p in patch.photographs if p.k in left]
     if not used or not tested:
-        return
+        return []
     priors, noise = learned
     patch.refresh(None)
     plain = patch.start(used)
     fields = plain.copy()
     plain[1] = _shared_albedo(ground, calibration, patch, used)
     without = [patch.predict(p, plain).image for p in tested]
-    for number in range(ROUNDS):
-        evidence = patch.evidence(fields, noise, used)
-        posterior = Posterior(evidence.products, patch.px, priors)
-        fields = posterior.mean(evidence.gradient, fields)
-        if number == 0:
-            patch.refresh(fields[0])
-    draw = posterior.draw(np.random.default_rng([SEED, *window[:2], min(left)]))
-    std = np.sqrt(smoothed(draw[1] ** 2) + unresolved(priors)[1] + evidence.doubt)
+    fields, posterior, evidence = fit(patch, fields, priors, noise, used)
+    rng = np.random.default_rng([SEED, *window[:2], min(left)])
+    turn = Turn(*(waves(x) for x in (fields, posterior.draw(rng), posterior.draw(rng, prior=False))))
+    std = np.sqrt(variances(posterior, evidence, priors, 1, rng)[1])
     own = float(np.median(calibration.spread.own.sum(axis=1)))
     judged, others = Window(*window).within(patch.box), np.zeros(patch.shape, np.uint8)
     for photograph in patch.photographs:
@@ -154,7 +183,9 @@ def _score(
               max(0, judged.col - box.col) : max(0, judged.col + judged.width - box.col)] = True  # fmt: skip
         known &= np.isfinite(before) & np.isfinite(found.image) & np.isfinite(photograph.measured)
         known &= others[box.part] > 1  # one image tells neither heights nor albedo
-        errors = [np.where(known, (v - photograph.measured) ** 2, 0) for v in (found.image, before)]
+        # as one who has not seen it takes it: a calibrated image has no gain of its own
+        measured = photograph.measured * np.float32(calibration.gain[photograph.k] if ground.units == "iof" else 1)
+        errors = [np.where(known, (v - measured) ** 2, 0) for v in (found.image, before)]
         for part, corner in _quarters(box, judged):
             sums = [float(e[part].sum(dtype=float)) for e in errors]
             if known[part].any():
@@ -170,6 +201,7 @@ def _score(
         scores.residual.append((np.sqrt(errors[0])[use] / unit[use])[::THINNED].astype(np.float32))
         scores.image.append(np.full(len(scores.place[-1]), photograph.k, np.intp))
     patch.refresh(None)
+    return [turn]
 
 
 def _quarters(box: Window, judged: Window) -> list[tuple[tuple[slice, slice], tuple[int, int]]]:
@@ -224,8 +256,3 @@ def _with_intervals(calibration: Calibration, scores: Scores) -> Calibration:
         if not lit.all():
             shadow = unseen_widths(residual[~lit], place[~lit] - bins, image[~lit], 1)[:, 0]
     return replace(calibration, interval=interval, shadow=shadow)
-
-
-def smoothed(squares: Floats32) -> Floats32:
-    """Local mean of squares of draws (H, W)."""
-    return np.asarray(cv2.GaussianBlur(squares, (0, 0), SMOOTHED_PX), np.float32)

@@ -98,7 +98,7 @@ def _updated(priors: Priors, sums: Sums) -> Priors:
     before = priors.trust.variance
     free = np.maximum(1 - sums.fitted * before / np.maximum(sums.white, 1e-30), LEAST_SHARE)
     now = free * sums.white / np.maximum(sums.left, 1e-30)
-    return Priors(spectra[0], spectra[1], Spectrum(np.clip(np.clip(now, before / STEP, before * STEP), *TRUST)))
+    return Priors(*spectra, Spectrum(np.clip(np.clip(now, before / STEP, before * STEP), *TRUST)))
 
 
 def _bounded(variance: Floats, told: Floats, longest: float) -> Floats:

@@ -13,14 +13,14 @@ Yuille 2010, NIPS 23).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numba
 import numpy as np
 
 from stages.common.arrays import Floats32
 from stages.refine.patch import BROAD_PX
-from stages.refine.spectrum import Spectrum, collect, frequencies, waves
+from stages.refine.spectrum import WAVELENGTHS, Spectrum, collect, frequencies, waves
 
 ITERATIONS = 80
 TOLERANCE = 1e-3  # of the residual's norm, preconditioned
@@ -31,11 +31,12 @@ FIELDS = 2  # heights, log albedo
 
 @dataclass(frozen=True)
 class Priors:
-    """Spectra of the heights' correction (m2) and of log albedo, and F."""
+    """Spectra of the heights' correction (m2) and of log albedo, and F; widening : variance of both over what the posterior says"""
 
     heights: Spectrum
     albedo: Spectrum
     trust: Spectrum
+    widening: Spectrum = field(default_factory=lambda: Spectrum(np.ones((FIELDS, len(WAVELENGTHS)))))
 
 
 def unresolved(priors: Priors, size: int = 256) -> tuple[float, float]:
@@ -79,10 +80,12 @@ class Posterior:
         seen = _reduced(self._root, gradient) + self.seen(around)
         return self._fields(self._solve(self._back(self._trust * waves(seen))))
 
-    def draw(self, rng: np.random.Generator) -> Floats32:
-        """(2, H, W) by which one draw of the posterior differs from its mean."""
-        noise = rng.standard_normal((3, *self.shape), np.float32)
-        return self._fields(self._solve(self._back(noise) + rng.standard_normal((FIELDS, *self.shape), np.float32)))
+    def draw(self, rng: np.random.Generator, prior: bool = True) -> Floats32:
+        """(2, H, W) by which one draw of the posterior differs from its mean. prior : False for what noise alone does to the mean"""
+        right = self._back(rng.standard_normal((3, *self.shape), np.float32))
+        if prior:
+            right += rng.standard_normal((FIELDS, *self.shape), np.float32)
+        return self._fields(self._solve(right))
 
     def misfit(self, gradient: Floats32, around: Floats32, found: Floats32) -> Floats32:
         """(3, H, W) of what the images say and ``found`` (2, H, W) does not; arguments as for :meth:`mean`"""

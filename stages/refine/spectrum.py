@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 
+import cv2
 import numpy as np
 from scipy import fft
 
@@ -19,16 +20,22 @@ WAVELENGTHS = 2.0 ** np.arange(
 )  # px: between these the logarithm of a variance is linear in that of the frequency
 _LOG_FREQUENCY = -np.log(WAVELENGTHS)
 LEAST = 1e-30
+SMOOTHED_PX = 4.0  # over which the squares of draws are averaged
 
 
 @dataclass(frozen=True)
 class Spectrum:
-    """Variance of a field's waves at WAVELENGTHS; beyond the ends it is that of the ends. 0 everywhere for a known field."""
+    """Variance of a field's waves at WAVELENGTHS, (K,) or of several fields (n, K); beyond the ends it is that of the ends.
+
+    0 everywhere for a known field.
+    """
 
     variance: Floats
 
     def of(self, shape: tuple[int, int]) -> Floats32:
-        """(H, W) variance of every wave of a window."""
+        """(H, W) variance of every wave of a window, (n, H, W) of several fields."""
+        if self.variance.ndim > 1:
+            return np.stack([Spectrum(v).of(shape) for v in self.variance])
         if not self.variance.any():
             return np.zeros(shape, np.float32)
         logs = np.log(np.maximum(self.variance, LEAST))
@@ -80,3 +87,8 @@ def waves(fields: Floats32) -> Floats32:
 def collect(coefficients: Floats32) -> Floats32:
     """The inverse of :func:`waves`."""
     return np.asarray(fft.idctn(coefficients, axes=(-2, -1), norm="ortho"), np.float32)
+
+
+def smoothed(squares: Floats32) -> Floats32:
+    """Local mean of squares of draws (H, W)."""
+    return np.asarray(cv2.GaussianBlur(squares, (0, 0), SMOOTHED_PX), np.float32)

@@ -36,10 +36,10 @@ from stages.physics.maps.grid import read_grid
 from stages.physics.maps.window import Box, Window
 from stages.refine import calibrate_to
 from stages.refine.config import Config, Summary
-from stages.refine.judge import ROUNDS, Learned, find_out, smoothed
+from stages.refine.fit import fit, variances
+from stages.refine.judge import Learned, find_out
 from stages.refine.learn import SEED
 from stages.refine.patch import Patch
-from stages.refine.solve import Posterior, unresolved
 from stages.refine.spectrum import WAVELENGTHS
 
 HALO_PX = 64
@@ -164,20 +164,8 @@ def work_block(ground: Ground, learned: Learned, block: Box, draws: int) -> list
     patch = Patch(ground, learned.calibration, box)
     if not patch.photographs:
         return kept
-    fields = patch.start()
-    for number in range(ROUNDS):
-        evidence = patch.evidence(fields, learned.noise, relinearise=number == 1)
-        posterior = Posterior(evidence.products, patch.px, learned.priors)
-        fields = posterior.mean(evidence.gradient, fields)
-        if number == 0:
-            patch.refresh(fields[0])
-    rng = np.random.default_rng([SEED, *block[:2]])
-    squares = np.zeros_like(fields)
-    for _ in range(draws):
-        squares += posterior.draw(rng) ** 2
-    variance = np.stack([smoothed(s) for s in squares]) / np.float32(draws)
-    variance += np.array(unresolved(learned.priors), np.float32)[:, None, None]
-    variance[1] += evidence.doubt
+    fields, posterior, evidence = fit(patch, patch.start(), learned.priors, learned.noise)
+    variance = variances(posterior, evidence, learned.priors, draws, np.random.default_rng([SEED, *block[:2]]))
     inner = Window(*block).within(box).part
     seen = evidence.products[0] > 0
     share = _share(seen)[inner]

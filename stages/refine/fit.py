@@ -1,0 +1,39 @@
+"""One window's posterior, with slopes and shadows taken anew where it leads."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+import numpy as np
+
+from stages.common.arrays import Floats32
+from stages.refine.patch import Evidence, Noise, Patch
+from stages.refine.solve import Posterior, Priors, unresolved
+from stages.refine.spectrum import collect, smoothed, waves
+
+ROUNDS = 3
+
+
+def fit(
+    patch: Patch, fields: Floats32, priors: Priors, noise: Noise, only: Collection[int] | None = None
+) -> tuple[Floats32, Posterior, Evidence]:
+    """(2, H, W) posterior mean of heights and log albedo, from ``fields`` on. only : images that count, None for all"""
+    for number in range(ROUNDS):
+        evidence = patch.evidence(fields, noise, only, relinearise=number == 1)
+        posterior = Posterior(evidence.products, patch.px, priors)
+        fields = posterior.mean(evidence.gradient, fields)
+        if number == 0:
+            patch.refresh(fields[0])
+    return fields, posterior, evidence
+
+
+def variances(
+    posterior: Posterior, evidence: Evidence, priors: Priors, draws: int, rng: np.random.Generator
+) -> Floats32:
+    """(2, H, W) of heights, m2, and of log albedo for an image under other angles, from draws of the posterior."""
+    wider = np.sqrt(priors.widening.of(posterior.shape))
+    squares = sum(collect(wider * waves(posterior.draw(rng))) ** 2 for _ in range(draws))
+    found = np.stack([smoothed(s) for s in squares]) / np.float32(draws)
+    found += np.array(unresolved(priors), np.float32)[:, None, None]
+    found[1] += evidence.doubt
+    return found
