@@ -238,7 +238,7 @@ def test_a_link_keeps_what_is_seen(small_artefacts, tmp_path):
         f"const states = {json.dumps(states)};"
         + """
         const canvas = document.getElementById("canvas"), found = [], soon = (ms) => new Promise((done) => setTimeout(done, ms));
-        const seen = () => [{...lunargr.state}, lunargr.pose()];
+        const seen = () => [{...lunargr.state, limits: lunargr.state.auto || lunargr.state.limits}, lunargr.pose()];
         for (const {photograph, ...state} of states) {
           if (photograph !== undefined) lunargr.photograph(photograph);
           lunargr.set(state);

@@ -11,18 +11,18 @@ from typing import Any
 
 import jinja2
 import numpy as np
+from numpy.typing import NDArray
 
 from stages.view.frames import NODES, Frames
-from stages.view.layers import Content
-from stages.view.packing import Blob, pack_map, spread_step
+from stages.view.layers import Content, block_mean
+from stages.view.packing import Blob, Packer, spread_step
 from stages.view.photographs import Photograph
+from stages.view.steps import choose_steps
 
 HEIGHT_STEP = 1e-3  # of a pixel: slopes are then kept to 2e-4
-# Steps of a map's range. Twice what a colour bar shows; what makes the picture is then kept to a few parts in ten thousand.
-LEVELS = 512
-# Of other maps, which no picture is made of: as many as a colour bar has colours.
-OTHER_LEVELS = 256
-PHOTOGRAPH_LEVELS = 1024
+PHOTOGRAPH_LEVELS = 256  # steps of its range
+# Of maps that no picture is made of: steps of the range, and pixels along each side of a block whose mean is kept.
+OTHER_LEVELS, OTHER_BLOCK = 64, 3
 SCRIPTS = (
     "decode.js", "ground.js", "coarse.js", "shadows.js", "relight.js", "terrain.js", "panel.js", "photographs.js", "address.js",
     "main.js",
@@ -63,6 +63,9 @@ def describe(content: Content, frames: Frames, photographs: Sequence[Photograph]
     mapped = known.copy()
     for layer in content.coefficients:
         mapped &= np.isfinite(layer.values)
+    levels, steps, error = choose_steps(content, mapped)
+    packer = Packer()
+    elevation = blob.add_map(packer.pack(content.elevation, known, HEIGHT_STEP * grid.gsd))
     fields = []
     for k, layer in enumerate([*content.coefficients, *content.others]):
         good = np.isfinite(layer.values)
@@ -72,10 +75,13 @@ def describe(content: Content, frames: Frames, photographs: Sequence[Photograph]
         if high - low <= SAME * max(abs(low), abs(high)):
             entry["constant"] = high
             continue
-        levels = LEVELS if k < len(content.coefficients) else OTHER_LEVELS
-        packed = pack_map(layer.values, good, spread_step(layer.values, good, levels))
-        entry["map"] = blob.add_map(packed)
-        # most maps are known where the coefficients are
+        values, step = layer.values, steps[k] if k < len(steps) else 0.0
+        if k >= len(steps):
+            values = _blocks(values)
+            good = np.isfinite(values)
+            step = spread_step(values, good, OTHER_LEVELS)
+        entry["map"] = blob.add_map(packer.pack(values, good, step))
+        # coefficients are mostly known where all others are
         if not np.array_equal(good, mapped):
             entry["known"] = blob.add_mask(good)
     return {
@@ -87,7 +93,10 @@ def describe(content: Content, frames: Frames, photographs: Sequence[Photograph]
         "brightness": content.brightness,
         "model": {"name": content.model.name, "title": content.model.title, "formula": content.model.formula},
         "count": len(content.coefficients),
-        "elevation": blob.add_map(pack_map(content.elevation, known, HEIGHT_STEP * grid.gsd)),
+        "levels": levels,
+        "error": error,
+        "block": OTHER_BLOCK,
+        "elevation": elevation,
         "elevation_known": blob.add_mask(known),
         "mapped": blob.add_mask(mapped),
         "fields": fields,
@@ -101,6 +110,12 @@ def describe(content: Content, frames: Frames, photographs: Sequence[Photograph]
     }
 
 
+def _blocks(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Means over blocks of OTHER_BLOCK pixels a side; those at the border go on beyond it as they end."""
+    height, width = values.shape
+    return block_mean(np.pad(values, ((0, -height % OTHER_BLOCK), (0, -width % OTHER_BLOCK)), "edge"), OTHER_BLOCK)
+
+
 def _photograph(photograph: Photograph, blob: Blob) -> dict[str, Any]:
     good = np.isfinite(photograph.image)
     return {
@@ -111,7 +126,9 @@ def _photograph(photograph: Photograph, blob: Blob) -> dict[str, Any]:
         "azimuth": photograph.sun_azimuth_deg,
         "elevation": photograph.sun_elevation_deg,
         "camera": photograph.camera.tolist(),
-        "map": blob.add_map(pack_map(photograph.image, good, spread_step(photograph.image, good, PHOTOGRAPH_LEVELS))),
+        "map": blob.add_map(
+            Packer().pack(photograph.image, good, spread_step(photograph.image, good, PHOTOGRAPH_LEVELS))
+        ),
         "known": blob.add_mask(good),
     }
 

@@ -17,7 +17,7 @@ class Panel {
     byId("auto").onchange = (event) => act.change({ auto: event.target.checked });
     for (const id of ["black", "white"]) byId(id).onchange = () => this.typedContrast();
     const means = head.factor > 1 ? `, each the mean of ${head.factor} × ${head.factor} of the file's` : "";
-    byId("about").textContent = `${head.width} × ${head.height} pixels of ${short(head.gsd)} m${means}. Radiance factor (${head.brightness}), with cos(incidence) in it; negative values are shown as 0. Made by ${document.querySelector("meta[name=generator]").content}.`;
+    byId("about").textContent = `${head.width} × ${head.height} pixels of ${short(head.gsd)} m${means}. Radiance factor (${head.brightness}), with cos(incidence) in it; negative values are shown as 0. Coefficients are kept to 1/${2 * head.levels} of their range, which leaves I/F to ${short(100 * head.error)} % (RMS); other maps are means of ${head.block} × ${head.block} pixels. Made by ${document.querySelector("meta[name=generator]").content}.`;
     window.addEventListener("keydown", (event) => this.key(event));
   }
 
