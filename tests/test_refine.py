@@ -168,3 +168,15 @@ def test_held_out_images_are_scored_with_the_refined_elevation(planted, tmp_path
     assert mse["refined"] < 0.5 * mse["albedo"] < mse["terrain"]
     assert result["gains"]["refined"]["albedo"]["gain_percent"] > 50
     assert read(fold, "albedo_image_id")[0].astype(str).tolist() == ["IMG1", "IMG3", "IMG5"]
+
+
+def test_the_geotiff_is_a_dem_for_ingest(found, tmp_path):
+    from stages import ingest
+    from stages.physics.maps.geotiff import write_geotiff
+    from stages.physics.maps.grid import read_grid
+
+    picture, scene = tmp_path / "refined.tif", tmp_path / "scene.h5"
+    with h5py.File(found[1]) as file:
+        write_geotiff(picture, file, read_grid(file, found[1]))
+    ingest.run(picture, None, scene, ingest.Config(crop=64))
+    np.testing.assert_array_equal(read(scene, "elevation")[0], read(found[1], "elevation")[0])

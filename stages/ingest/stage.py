@@ -207,7 +207,7 @@ def _open_terrain(
             "`shard`: the DEM comes first, then its images. Run 'lunargr ingest DEM' with `shard` and without `images`, and merge; "
             "then give that scene in place of the DEM, with `images` and `shard`."
         )
-    with rasters.open_raster(dem, "a DEM") as dataset:
+    with rasters.open_raster(dem, "a DEM", "elevation") as dataset:
         crs = require_crs(str(dem), dataset.crs, dataset.transform, body)
         plan = plan_grid(dem, dataset, config.gsd, body.radius, progress)
         sphere = crs_radius(crs)
@@ -227,7 +227,7 @@ def _open_terrain(
 
 def _count_bands(dem: Path, config: Config) -> int:
     """Rows of blocks of a raster's grid: more shards than these have nothing to do."""
-    with rasters.open_raster(dem, "a DEM") as dataset:
+    with rasters.open_raster(dem, "a DEM", "elevation") as dataset:
         body = find_body(config.body)
         require_crs(str(dem), dataset.crs, dataset.transform, body)
         plan = plan_grid(dem, dataset, config.gsd, body.radius)

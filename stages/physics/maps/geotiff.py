@@ -28,7 +28,8 @@ from schemas.reading import read_strings
 from stages.physics.maps.grid import Grid
 
 TAGS = ("model", "quantity", "gsd_m", "body_radius_m")
-ALBEDO_BANDS = ("albedo", "albedo_std", "elevation_correction", "elevation_std")
+ALBEDO_BANDS = ("albedo", "albedo_std")
+REFINED_BANDS = ("elevation", "elevation_correction", "elevation_std")  # where photographs corrected the DEM
 MOSAIC_BANDS = ("mosaic", "mosaic_std", "mosaic_scatter", "mosaic_images")
 BLOCK, STRIP, COLUMNS = 256, 512, 4096  # px
 
@@ -112,15 +113,17 @@ def _as_full_disk() -> Iterator[None]:
 def write_geotiff(path: Path, file: h5py.File, grid: Grid) -> None:
     """The map that an open artefact holds, as a cloud-optimised GeoTIFF: coefficients of an svbrdf.h5, or mosaics."""
     names, fields, tags = (_mosaics if "mosaic" in file else _coefficients)(file)
-    with atomic_path(path) as partial, MapTiff(partial, grid, names, tags, ["1"] * len(names)) as tiff:
+    units = ["m" if name in REFINED_BANDS else "1" for name in names]
+    with atomic_path(path) as partial, MapTiff(partial, grid, names, tags, units) as tiff:
         tiff.put_all(*fields)
 
 
 def _coefficients(file: h5py.File) -> tuple[list[str], list[h5py.Dataset], dict[str, str]]:
-    """Bands, variables and tags of an svbrdf.h5; standard deviations and albedo are further bands."""
+    """Bands, variables and tags of an svbrdf.h5; standard deviations, albedo and refined elevations are further bands."""
     fields = [file[name] for name in ("coefficients", "coefficients_std") if name in file]
     maps = read_strings(file, "map_name") if len(fields) > 1 else []
     further = [name for name in ALBEDO_BANDS if name in file]
+    further += REFINED_BANDS if REFINED_BANDS[1] in file else ()
     names = [*band_names(read_strings(file, "coefficient_name"), maps), *further]
     return names, [*fields, *(file[name] for name in further)], map_tags(names, file.attrs)
 

@@ -40,14 +40,20 @@ LARGEST_WINDOW = 1 << 22  # source pixels that are warped at a time: 0.2 GB with
 
 
 @contextlib.contextmanager
-def open_raster(path: Path, what: str = "a raster") -> Iterator[DatasetReader]:
-    """Open a raster for reading. Raises InputError for a missing, damaged or unknown file, also while reading."""
+def open_raster(path: Path, what: str = "a raster", band: str = "") -> Iterator[DatasetReader]:
+    """Open a raster for reading, as of one band where one of several has the name ``band``.
+
+    Raises InputError for a missing, damaged or unknown file, also while reading.
+    """
     check_file(Path(path), what)
     silence_hdf5()
     if h5py.is_hdf5(path):  # of a damaged one GDAL's HDF5 library would print its whole error stack
         open_hdf5(Path(path)).close()
     try:
         dataset = open_raster_file(Path(path))
+        if dataset.count > 1 and dataset.descriptions.count(band) == 1:
+            dataset.close()
+            dataset = rasterio.open(f"vrt://{path}?bands={dataset.descriptions.index(band) + 1}")
     except RasterioIOError as error:
         raise InputError(
             f"{path}: expected {what} that GDAL reads, found something else ({_one_line(error)}); is it the right file?"

@@ -178,7 +178,7 @@ def open_surface(path: Path, model: str | None, parameters: Mapping[str, float],
     Raises LunargrError.
     """
     if path.suffix.lower() not in _HDF5_SUFFIXES:
-        with open_raster(path, "a DEM, scene.h5 or svbrdf.h5") as dataset:
+        with open_raster(path, "a DEM, scene.h5 or svbrdf.h5", "elevation") as dataset:
             grid = _metric_grid(path, dataset, body)
             yield _uniform_surface(path, grid, _raw_elevation(dataset, body), model, parameters)
         return
