@@ -17,6 +17,9 @@ from stages import render, view
 from stages.physics.maps.grid import read_grid
 from stages.physics.photometry import evaluate, get_model, model_names
 from stages.render.pictures import read_exr
+from stages.view.frames import make_frames
+from stages.view.layers import read_content
+from stages.view.photographs import read_photographs
 
 SUNS = ((270.0, 25.0), (80.0, 6.0), (200.0, 12.0), (40.0, 45.0), (330.0, 75.0))
 FAMILIES = ("M2", "hapke", "lunar_lambert", "kernels")
@@ -306,6 +309,45 @@ def test_photographs_match_the_page_under_their_own_sun(small_artefacts, tmp_pat
     view.run(map_of(small_artefacts["scene"], tmp_path), small_artefacts["pairs"], page, view.Config(photographs=2))
     text = run_in_page(page, "lunargr.photograph(1); return document.getElementById('photograph-text').textContent")
     assert float(re.search(r"correlation (-?[\d.]+)", text).group(1)) > 0.8, text
+
+
+def test_a_photograph_is_swiped_over_the_rendering(small_artefacts, tmp_path):
+    from test_view import map_of
+
+    page, source = tmp_path / "v.html", map_of(small_artefacts["scene"], tmp_path)
+    view.run(source, small_artefacts["pairs"], page, view.Config(photographs=1))
+    content = read_content(source, 2048)
+    given = read_photographs(small_artefacts["pairs"], content.grid, 1, make_frames(content.grid), 1)[0]
+    row, col = (n // 2 for n in given.image.shape)
+    shown = run_in_page(
+        page,
+        f"""
+        lunargr.photograph(0);
+        const canvas = document.getElementById("canvas"), swipe = document.getElementById("swipe"), found = {{}};
+        const copy = document.createElement("canvas");
+        Object.assign(copy, {{width: canvas.width, height: canvas.height}});
+        const context = copy.getContext("2d", {{willReadFrequently: true}}), middle = [canvas.width / 2, canvas.height / 2].map(Math.round);
+        const grey = (x, y) => Float32Array.from(context.getImageData(middle[0] + x, middle[1] + y, 60, 60).data.filter((_, k) => k % 4 === 0));
+        for (const share of [0, 0.5, 1]) {{
+          swipe.value = share;
+          swipe.dispatchEvent(new Event("input"));
+          lunargr.set({{}});
+          context.drawImage(canvas, 0, 0);
+          found[share] = [grey(-70, -30), grey(10, -30), grey(-260, -290)];
+        }}
+        return {{found, values: lunargr.values({given.row + row}, {given.col + col}), residual: document.getElementById("residual").width}};
+        """,
+    )
+    (left_0, right_0, out_0), (left, right, out), (left_1, right_1, out_1) = (
+        shown["found"][k] for k in ("0", "0.5", "1")
+    )
+    assert np.array_equal(left, left_1) and np.array_equal(right, right_0)
+    assert np.array_equal(out, out_0) and np.array_equal(out, out_1)
+    assert not np.array_equal(left, left_0) and not np.array_equal(right, right_1)
+    known = given.image[np.isfinite(given.image)]
+    half_step = np.subtract(*np.percentile(known, (99, 1))) / 512
+    assert dict(shown["values"])["Measured"] and shown["residual"] == given.image.shape[1]
+    assert float(dict(shown["values"])["Measured"]) == pytest.approx(given.image[row, col], abs=1.1 * half_step + 1e-4)
 
 
 def test_the_page_works_under_its_own_policy_of_no_network_at_all(tmp_path):

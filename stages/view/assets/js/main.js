@@ -48,7 +48,7 @@ class App {
     Object.assign(this, { head, page, relighter, terrain, state, dirty: false, playing: false, frames: { whole: 0, coarse: 0 } });
     this.canvas = terrain.renderer.domElement;
     this.panel = new Panel(head, relighter.layers, this);
-    this.photographs = new Photographs(head, page, relighter, this);
+    this.photographs = new Photographs(head, page, relighter, terrain, this);
     for (const controls of Object.values(terrain.controls)) {
       controls.addEventListener("change", () => (terrain.keep(), this.ask()));
       controls.addEventListener("end", () => this.sayInAddress());
@@ -201,7 +201,7 @@ class App {
       this.frames[coarse ? "coarse" : "whole"]++;
     }
     if (state.auto) state.limits = this.found;
-    terrain.draw(relighter.shown.texture, span, layer.colours, state.limits, coarse);
+    terrain.draw(relighter.shown.texture, span, layer.colours, state.limits, coarse, state.layer === 0);
     if (coarse) this.drawn = null;
     else if (key !== this.drawn) {
       this.drawn = key;
@@ -213,8 +213,11 @@ class App {
     this.panel.needle(state.view === "space" ? terrain.controls.space.getAzimuthalAngle() : 0);
     if (coarse) return;
     const compared = `${state.photograph} ${state.shadows}`;
-    if (compared !== this.compared) this.photographs.refresh(state.photograph);
-    this.compared = compared;
+    if (compared !== this.compared) {
+      this.compared = compared;
+      this.photographs.refresh(state.photograph);
+      this.ask();  // the photograph now lies over the map
+    }
     if (this.pointer) this.readPointer();
   }
 
@@ -278,7 +281,8 @@ class App {
   }
 
   rows(row, col) {
-    return pixelRows(this.head, this.page, this.relighter, this.terrain.ground, row, col);
+    const found = pixelRows(this.head, this.page, this.relighter, this.terrain.ground, row, col), measured = this.photographs.at(row, col);
+    return measured > -Infinity ? [...found, ["Measured", short(measured)]] : found;
   }
 
   /** For tests and for the curious: the page's own numbers */

@@ -20,6 +20,8 @@ class Terrain {
         limits: { value: new THREE.Vector2(0, 1) },
         outline: { value: [0, 0, 0, 0] },
         outline_colour: { value: new THREE.Vector3(1, 0.72, 0.2) },
+        photograph: { value: texture(new Uint8Array(4), 1, 1, THREE.RGBAFormat, THREE.UnsignedByteType) },
+        swipe: { value: 0 },
         picking: { value: false },
       },
       side: 2,
@@ -45,6 +47,7 @@ class Terrain {
     this.controls.space.addEventListener("start", () => this.aim());
     this.controls.map.minZoom = 0.5;
     this.controls.map.maxZoom = Math.max(head.height, head.width) / 8;
+    this.share = 0.5;  // of a photograph that lies over the rendering
     this.pixel = target(1, 1, THREE.RGBAFormat, THREE.FloatType, { depthBuffer: true });
     this.reset("map");
     this.reset("space");
@@ -118,7 +121,7 @@ class Terrain {
     const { head } = this, side = Math.max(head.height, head.width), camera = this.cameras.map;
     const x = ((col + width / 2 - head.width / 2) * 2) / side, y = ((head.height / 2 - row - height / 2) * 2) / side;
     camera.position.set(x, y, 10);
-    camera.zoom = (0.3 * side) / Math.max(height, width);
+    camera.zoom = (0.7 * side) / Math.max(height, width);
     camera.updateProjectionMatrix();
     this.controls.map.target.set(x, y, 0);
     this.controls.map.update();
@@ -145,12 +148,13 @@ class Terrain {
     return (camera.right - camera.left) / camera.zoom / this.renderer.domElement.clientWidth;
   }
 
-  /** layer: the texture that shows it; coarse: with fewer facets */
-  draw(layer, span, colours, limits, coarse) {
+  /** layer: the texture that shows it; coarse: with fewer facets; measurable: a photograph may lie over it */
+  draw(layer, span, colours, limits, coarse, measurable) {
     const { uniforms } = this.material, names = Object.keys(this.head.colours);
     uniforms.colour_row.value = colours ? (names.indexOf(colours) + 0.5) / names.length : -1;
     uniforms.limits.value.set((limits[0] - span[0]) / (span[1] - span[0]), (limits[1] - span[0]) / (span[1] - span[0]));
     uniforms.layer.value = layer;
+    uniforms.swipe.value = this.overlay && measurable ? this.share : 0;
     uniforms.picking.value = false;
     this.renderer.render((coarse ? this.coarse : this.scenes)[this.view], this.cameras[this.view]);
   }
@@ -165,6 +169,19 @@ class Terrain {
     const { width, height } = this.head, p = photograph;
     const box = p ? [p.col / width, p.row / height, (p.col + p.width) / width, (p.row + p.height) / height] : [0, 0, 0, 0];
     this.material.uniforms.outline.value = box;
+  }
+
+  /** A measured crop, in the image's unit, to be drawn over the left part of its outline; or null */
+  setPhotograph(photograph) {
+    const { uniforms } = this.material;
+    if (this.overlay) this.overlay.dispose();
+    this.overlay = null;
+    if (!photograph) return;
+    const { values, width, height } = photograph, half = THREE.DataUtils.toHalfFloat, data = new Uint16Array(2 * values.length);
+    values.forEach((v, k) => Number.isNaN(v) || data.set([half(v), half(1)], 2 * k));
+    this.overlay = texture(data, width, height, THREE.RGFormat, THREE.HalfFloatType);
+    Object.assign(this.overlay, { magFilter: THREE.LinearFilter, minFilter: THREE.LinearMipmapLinearFilter, generateMipmaps: true });
+    uniforms.photograph.value = this.overlay;
   }
 
   /** {row, col} under a place of the canvas (CSS pixels), or null */
