@@ -180,3 +180,13 @@ def test_the_geotiff_is_a_dem_for_ingest(found, tmp_path):
         write_geotiff(picture, file, read_grid(file, found[1]))
     ingest.run(picture, None, scene, ingest.Config(crop=64))
     np.testing.assert_array_equal(read(scene, "elevation")[0], read(found[1], "elevation")[0])
+
+
+def test_the_report_shows_the_relief_before_and_after(found, tmp_path):
+    page = tmp_path / "report.html"
+    code, _ = run_command("report", found[1], "-o", page)
+    assert code == 0
+    text = page.read_text()
+    gain, low, high = read(found[1], "refine_gain_percent")[0]
+    assert f"{gain:.1f} % lower" in text and f"({low:.1f} to {high:.1f})" in text
+    assert "Correction of the elevation, m" in text and "what the DEM lacks" in text

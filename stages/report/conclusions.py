@@ -64,25 +64,34 @@ def _gains(result: dict[str, Any]) -> Iterator[tuple[str, str, str, dict[str, An
                 yield words, which, result.get("titles", {}).get(other, str(other).replace("_", " ")), gain
 
 
+UNSEEN = (  # (map, what it is compared with, both in words), the first that a result has
+    ("refined", "albedo", "refined elevations and albedo", "albedo alone"),
+    ("albedo", "terrain", "albedo from the other photographs", "the map from terrain alone"),
+)
+
+
 def held_out_images(result: dict[str, Any]) -> list[Sentence]:
-    """What albedo from photographs gains under images that had no part in it: another claim than unseen ground."""
-    gain = result["gains"].get("albedo", {}).get("terrain")
-    if not gain or gain.get("gain_percent") is None:
-        return []
+    """What photographs gain under images that had no part in it: another claim than unseen ground."""
     sun = result.get("nearest_used_sun_deg") or {}
     unseen = f"{counted(len(result.get('images', [])), 'unseen image')}, {basis(result)}"
     if sun:
         unseen += f", their Suns {sun['least']:.0f} to {sun['most']:.0f} deg from the nearest one used"
-    what = "Another claim: on seen ground, under unseen images, albedo from the other photographs"
-    return [compared(what, "the map from terrain alone", gain, unseen)]
+    what = "Another claim: on seen ground, under unseen images"
+    return [compared(f"{what}, {ours}", other, gain, unseen) for ours, other, gain in _unseen(result)]
 
 
 def held_out_numbers(result: dict[str, Any]) -> list[Number]:
     """The same gain as a change of the squared error."""
-    gain = result["gains"].get("albedo", {}).get("terrain")
-    if not gain or gain.get("gain_percent") is None:
-        return []
-    return [error_change(gain, "squared error under unseen images, with albedo against the map from terrain alone")]
+    return [
+        error_change(gain, f"squared error under unseen images, {ours} against {other}")
+        for ours, other, gain in _unseen(result)
+    ]
+
+
+def _unseen(result: dict[str, Any]) -> list[tuple[str, str, dict[str, Any]]]:
+    """Both maps in words and the gain, of the first comparison that there is."""
+    found = [(ours, other, result["gains"].get(key, {}).get(base)) for key, base, ours, other in UNSEEN]
+    return [(ours, other, gain) for ours, other, gain in found if gain and gain.get("gain_percent") is not None][:1]
 
 
 def albedo(file: h5py.File) -> list[Sentence]:

@@ -36,7 +36,7 @@ def svbrdf(file: h5py.File) -> page.Section:
         if len(present) and np.ptp(present) <= 1e-6 * max(1e-12, abs(float(present.mean()))):
             constant.append([name, _unit(units.get(name, "1")) or "-", f"{float(present.mean()):.4g}"])
         else:
-            figures.append(_map(file, values, f"Coefficient {name}", units.get(name, "1")))
+            figures.append(draw_map(file, values, f"Coefficient {name}", units.get(name, "1")))
     height, width = file["valid"].shape
     gsd = float(file.attrs["gsd_m"])
     section.add(
@@ -68,7 +68,7 @@ def _deviations(file: h5py.File, known: np.ndarray, units: dict[str, str]) -> li
     for k, name in enumerate(read_strings(file, "map_name")):
         values = pictures.read_thinned(file["coefficients_std"], k, longest=_longest(file))[0]
         title = f"Standard deviation of {name}"
-        figures.append(_map(file, np.where(known, values, np.nan), title, units.get(name, "1"), "viridis"))
+        figures.append(draw_map(file, np.where(known, values, np.nan), title, units.get(name, "1"), "viridis"))
     return figures
 
 
@@ -78,7 +78,7 @@ def _albedo(file: h5py.File, known: np.ndarray) -> list[Markup]:
     for name, (title, colours) in ALBEDO.items():
         if name in file:
             values = pictures.read_thinned(file[name], longest=_longest(file))[0].astype(float)
-            shown.append(_map(file, np.where(known, values, np.nan), title, "1", colours))
+            shown.append(draw_map(file, np.where(known, values, np.nan), title, "1", colours))
     count = len(read_strings(file, "albedo_image_id"))
     text = (
         f"What {count} photographs show in the same way and the terrain does not. It is 1 where they say nothing or do "
@@ -87,7 +87,7 @@ def _albedo(file: h5py.File, known: np.ndarray) -> list[Markup]:
     return [page.paragraph(text), page.grid(shown)]
 
 
-def _map(file: h5py.File, values: np.ndarray, title: str, unit: str, colours: str = "magma") -> Markup:
+def draw_map(file: h5py.File, values: np.ndarray, title: str, unit: str, colours: str = "magma") -> Markup:
     """One map with statistics, colour bar, scale bar and north arrow."""
     low, high = pictures.limits(values, 1.0)
     present = values[np.isfinite(values)]

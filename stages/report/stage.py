@@ -23,7 +23,7 @@ from stages.common import page
 from stages.common.page import diagnosis, pictures
 from stages.common.page.sentences import Number, Sentence
 from stages.common.progress import Progress
-from stages.report import conclusions, maps, results, sections
+from stages.report import conclusions, relief, results, sections
 from stages.report.config import Config
 from stages.report.held_out import held_out_images
 
@@ -31,7 +31,7 @@ BUILDERS = {
     "scene": sections.scene,
     "pairs": sections.pairs,
     "checkpoint": sections.checkpoint,
-    "svbrdf": maps.svbrdf,
+    "svbrdf": relief.with_relief,
 }
 SENTENCES = {"checkpoint": conclusions.learned, "svbrdf": conclusions.albedo}
 # The order of the page; a page says the same whatever the order of its files.
