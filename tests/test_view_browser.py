@@ -14,7 +14,7 @@ from render_scene import LAT, LON, make_grid, smooth_maps, write_svbrdf
 
 from schemas.files.outputs import Output
 from stages import render, view
-from stages.physics.maps.grid import read_grid
+from stages.physics.maps.grid import read_grid, unit_vectors
 from stages.physics.photometry import evaluate, get_model, model_names
 from stages.render.pictures import read_exr
 from stages.view.frames import make_frames
@@ -348,6 +348,69 @@ def test_a_photograph_is_swiped_over_the_rendering(small_artefacts, tmp_path):
     half_step = np.subtract(*np.percentile(known, (99, 1))) / 512
     assert dict(shown["values"])["Measured"] and shown["residual"] == given.image.shape[1]
     assert float(dict(shown["values"])["Measured"]) == pytest.approx(given.image[row, col], abs=1.1 * half_step + 1e-4)
+
+
+def test_going_measuring_grid_and_scale_are_those_of_the_map(tmp_path):
+    rng, page = np.random.default_rng(5), tmp_path / "v.html"
+    grid, elevation = make_grid(96, 128, 20.0), 0.1 * hills(rng, 128, 20.0)[:96] + 900.0
+    coefficients = np.full((3, 96, 128), 0.1)
+    view.run(write_svbrdf(tmp_path / "m.h5", grid, elevation, coefficients, "M2"), None, page, view.Config())
+    to_lon, to_lat = (float(v) for v in grid.lonlat(30, 90))
+    found = run_in_page(
+        page,
+        f"const wanted = '{to_lon}, {to_lat}';"
+        + """
+        const byId = (id) => document.getElementById(id), canvas = byId("canvas"), found = {};
+        const middle = [canvas.clientWidth / 2, canvas.clientHeight / 2], centre = () => lunargr.pick(...middle);
+        const go = (text) => {
+          byId("go").value = text;
+          byId("go").dispatchEvent(new Event("change"));
+          return [byId("go").validity.valid, centre()];
+        };
+        const click = (x, y) => ["pointerdown", "pointerup"].map((kind) => canvas.dispatchEvent(
+          new PointerEvent(kind, {clientX: x, clientY: y, pointerId: 1, buttons: kind === "pointerup" ? 0 : 1, bubbles: true})));
+        canvas.setPointerCapture = canvas.releasePointerCapture = () => {};  // of pointers that no hand moves
+        byId("grid").click();
+        byId("measure").click();
+        found.ends = [[middle[0] - 150, middle[1] - 80], [middle[0] + 160, middle[1] + 90]].map((at) => (click(...at), lunargr.pick(...at)));
+        found.measured = byId("profile-text").textContent;
+        found.lines = [...document.querySelectorAll("#overlay polyline.grid:has(+ text)")].map((line) => {
+          const at = line.points[Math.floor(line.points.length / 2)], {row, col} = lunargr.pick(at.x, at.y) ?? {};
+          return [line.nextSibling.textContent, row, col];
+        });
+        found.far = go("0, 0");
+        found.wrong = go("north");
+        found.there = go(wanted);
+        lunargr.set({view: "space"});
+        found.space = go(wanted);
+        const wide = byId("scale-bar").querySelector("i").getBoundingClientRect().width;
+        found.bar = [byId("scale-bar").textContent.trim(), lunargr.pick(middle[0] - wide / 2, middle[1]), lunargr.pick(middle[0] + wide / 2, middle[1])];
+        return found;
+        """,
+    )
+
+    def apart(a, b):
+        points = [unit_vectors(*(float(v) for v in grid.lonlat(p["row"], p["col"]))) for p in (a, b)]
+        return grid.radius * float(np.linalg.norm(points[0] - points[1]))
+
+    a, b = found["ends"]
+    number, unit, rise = re.match(r"([\d.]+) (k?m), (?:up|down) ([\d.]+) m", found["measured"]).groups()
+    assert float(number) * {"m": 1, "km": 1000}[unit] == pytest.approx(apart(a, b), rel=1e-3)
+    assert float(rise) == pytest.approx(abs(elevation[b["row"], b["col"]] - elevation[a["row"], a["col"]]), abs=0.1)
+    assert len(found["lines"]) >= 6
+    for name, row, col in found["lines"]:
+        lon, lat = (float(v) for v in grid.lonlat(row, col))
+        pixel = 20.0 / grid.radius * 180 / np.pi
+        value = float(name.split("°")[0])
+        assert abs((lon % 360 - value) * np.cos(np.radians(lat)) if name.endswith("E") else lat - value) < 1.5 * pixel
+    assert not found["far"][0] and not found["wrong"][0]
+    for right, at in (found["there"], found["space"]):
+        assert right and abs(at["row"] - 30) <= 1 and abs(at["col"] - 90) <= 1
+    assert found["far"][1] == found["wrong"][1] != found["there"][1]
+    text, *sides = found["bar"]
+    number, unit = re.match(r"([\d.]+) (k?m) in the middle", text).groups()
+    # a bar of a hundred pixels, each side of it to the nearest pixel of 20 m
+    assert float(number) * {"m": 1, "km": 1000}[unit] == pytest.approx(apart(*sides), abs=25, rel=0.03)
 
 
 def test_the_page_works_under_its_own_policy_of_no_network_at_all(tmp_path):

@@ -37,12 +37,23 @@ class Ground {
 
   /** Where a ray from a point first meets the ground, or null; looked at in steps of 1/400 of ``reach`` m */
   hit(origin, direction, reach) {
-    const { width, height, radius } = this.head, at = origin.clone(), step = direction.clone().setLength(reach / 400);
+    const { radius } = this.head, at = origin.clone(), step = direction.clone().setLength(reach / 400);
     for (let k = 0; k < 400; k++) {
-      const { row, col } = this.place(at.add(step)), inside = row >= 0 && col >= 0 && row <= height - 1 && col <= width - 1;
-      if (inside && at.clone().setZ(at.z + radius).length() - radius <= this.height(row, col)) return at;
+      const place = this.place(at.add(step));
+      if (this.holds(place) && at.clone().setZ(at.z + radius).length() - radius <= this.height(place.row, place.col)) return at;
     }
     return null;
+  }
+
+  holds({ row, col }) {
+    return row >= 0 && col >= 0 && row <= this.head.height - 1 && col <= this.head.width - 1;
+  }
+
+  /** {row, col} of a longitude and latitude in degrees */
+  placeOf(lon, lat) {
+    const l = (lon * Math.PI) / 180, b = (lat * Math.PI) / 180, body = [Math.cos(b) * Math.cos(l), Math.cos(b) * Math.sin(l), Math.sin(b)];
+    const [x, y, z] = this.head.middle.map((axis) => axis[0] * body[0] + axis[1] * body[1] + axis[2] * body[2]), { radius } = this.head;
+    return z > 0 ? this.place(new THREE.Vector3(x * radius, y * radius, (z - 1) * radius)) : { row: NaN, col: NaN };
   }
 
   /** [longitude, latitude], degrees, the longitude from 0 to 360 */

@@ -48,6 +48,7 @@ class App {
     Object.assign(this, { head, page, relighter, terrain, state, dirty: false, playing: false, frames: { whole: 0, coarse: 0 } });
     this.canvas = terrain.renderer.domElement;
     this.panel = new Panel(head, relighter.layers, this);
+    this.overlay = new Overlay(head, page, terrain);
     this.photographs = new Photographs(head, page, relighter, terrain, this);
     for (const controls of Object.values(terrain.controls)) {
       controls.addEventListener("change", () => (terrain.keep(), this.ask()));
@@ -109,6 +110,29 @@ class App {
   reset() {
     this.terrain.reset();
     this.change({});
+  }
+
+  showGrid(shown) {
+    this.overlay.showGrid(shown);
+    this.overlay.draw();
+  }
+
+  /** Whether a click or tap takes up an end of what is measured */
+  measuring(on) {
+    this.measures = on;
+    Object.assign(this.overlay, { ends: [] });
+    byId("profile").hidden = true;
+    this.overlay.draw();
+  }
+
+  /** Whether the map holds this place, which is then in the middle */
+  goTo(lon, lat) {
+    const place = this.terrain.ground.placeOf(lon, lat);
+    if (!this.terrain.ground.holds(place)) return false;
+    this.overlay.mark = place;
+    this.terrain.goTo(place);
+    this.change({});
+    return true;
   }
 
   play() {
@@ -209,7 +233,8 @@ class App {
       this.slow = performance.now() - start > SLOW_MS;
     }
     this.panel.contrast(state.limits, layer.colours);
-    this.panel.scaleBar(terrain.unitsPerPixel());
+    this.panel.scaleBar(terrain.unitsPerPixel(), state.view === "space");
+    this.overlay.draw();
     this.panel.needle(state.view === "space" ? terrain.controls.space.getAzimuthalAngle() : 0);
     if (coarse) return;
     const compared = `${state.photograph} ${state.shadows}`;
@@ -241,7 +266,7 @@ class App {
       const box = canvas.getBoundingClientRect();
       return { x: event.clientX - box.left, y: event.clientY - box.top };
     };
-    let grabbed = null;
+    let grabbed = null, pressedAt = null;
     canvas.addEventListener("pointerdown", (event) => {
       if (!event.shiftKey) return;
       grabbed = { ...place(event), azimuth: state.azimuth, elevation: state.elevation };
@@ -253,9 +278,13 @@ class App {
       if (grabbed && event.buttons) this.sun(grabbed.azimuth + (this.pointer.x - grabbed.x) * 0.4, grabbed.elevation - (this.pointer.y - grabbed.y) * 0.2);
       else if (!event.buttons) this.readSoon();
     });
+    canvas.addEventListener("pointerdown", (event) => (pressedAt = place(event)));
     canvas.addEventListener("pointerup", (event) => {
       grabbed = null;
       this.pointer = place(event);
+      const still = pressedAt && Math.hypot(this.pointer.x - pressedAt.x, this.pointer.y - pressedAt.y) < 5;
+      const found = this.measures && still && this.terrain.pick(this.pointer.x, this.pointer.y);
+      if (found) this.overlay.measure(found), this.overlay.draw();
       this.readSoon();
     });
     canvas.addEventListener("pointerleave", (event) => {

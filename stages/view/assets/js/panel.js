@@ -14,6 +14,9 @@ class Panel {
     byId("reset").onclick = () => act.reset();
     byId("save").onclick = () => act.save();
     byId("link").onclick = () => act.copyLink(byId("link"));
+    byId("grid").onchange = (event) => act.showGrid(event.target.checked);
+    byId("measure").onchange = (event) => act.measuring(event.target.checked);
+    byId("go").onchange = (event) => this.go(event.target);
     byId("auto").onchange = (event) => act.change({ auto: event.target.checked });
     for (const id of ["black", "white"]) byId(id).onchange = () => this.typedContrast();
     const means = head.factor > 1 ? `, each the mean of ${head.factor} × ${head.factor} of the file's` : "";
@@ -42,6 +45,13 @@ class Panel {
     const { act } = this, limits = ["black", "white"].map((id) => (byId(id).value === "" ? NaN : Number(byId(id).value)));
     if (limits[0] < limits[1]) return act.change({ auto: false, limits });
     this.contrast(act.state.limits, this.layers[act.state.layer].colours, true);
+  }
+
+  /** To what was typed: longitude, latitude */
+  go(field) {
+    const [lon, lat, more] = field.value.split(",").map((text) => (text.trim() === "" ? NaN : Number(text))), right = more === undefined && Math.abs(lat) <= 90;
+    field.setCustomValidity(right && this.act.goTo(lon, lat) ? "" : "Give a longitude and a latitude on this map, in degrees: 20.5, -4.2");
+    field.reportValidity();
   }
 
   wireLayers() {
@@ -123,13 +133,12 @@ class Panel {
     context.putImageData(pixels, 0, 0);
   }
 
-  /** unitsPerPixel: of the flat map, whose longer side is 2 */
-  scaleBar(unitsPerPixel) {
-    const metres = (unitsPerPixel * this.head.gsd * Math.max(this.head.width, this.head.height)) / 2, wanted = 130 * metres;
-    const power = 10 ** Math.floor(Math.log10(wanted)), length = [5, 2, 1].map((k) => k * power).find((v) => v <= wanted);
+  /** unitsPerPixel: of the map, whose longer side is 2 */
+  scaleBar(unitsPerPixel, inSpace) {
+    const across = (unitsPerPixel * this.head.gsd * Math.max(this.head.width, this.head.height)) / 2, length = roundBelow(130 * across);
     const bar = byId("scale-bar");
-    bar.querySelector("i").style.width = `${length / metres}px`;
-    bar.querySelector("span").textContent = length >= 1000 ? `${short(length / 1000)} km` : `${short(length)} m`;
+    bar.querySelector("i").style.width = `${length / across}px`;
+    bar.querySelector("span").textContent = metres(length) + (inSpace ? " in the middle" : "");
   }
 
   values(rows) {
@@ -137,7 +146,7 @@ class Panel {
     list.replaceChildren(
       ...rows.flatMap(([name, value]) => {
         const term = document.createElement("dt"), text = document.createElement("dd");
-        term.textContent = name;
+        Object.assign(term, { textContent: name, title: name });
         text.textContent = value;
         return [term, text];
       }),

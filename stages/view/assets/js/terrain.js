@@ -116,6 +116,28 @@ class Terrain {
     this.keep();
   }
 
+  /** {row, col} -> [x, y] in CSS pixels of the canvas, or null behind the camera */
+  screen({ row, col }) {
+    const { clientWidth, clientHeight } = this.renderer.domElement, { x, y, z } = this.inScene(row, col).project(this.cameras[this.view]);
+    return z < 1 ? [((x + 1) / 2) * clientWidth, ((1 - y) / 2) * clientHeight] : null;
+  }
+
+  /** Of the view that is shown */
+  inScene(row, col) {
+    const { head } = this, side = Math.max(head.height, head.width);
+    if (this.view === "space") return this.ground.point(row, col).multiplyScalar(this.scale);
+    return new THREE.Vector3(((col + 0.5 - head.width / 2) * 2) / side, ((head.height / 2 - row - 0.5) * 2) / side, 0);
+  }
+
+  /** Bring a place into the middle of the picture. */
+  goTo({ row, col }) {
+    const { target } = this.controls[this.view], there = this.inScene(row, col);
+    this.cameras[this.view].position.add(there).sub(target);
+    target.copy(there);
+    this.controls[this.view].update();
+    this.keep();
+  }
+
   /** Look at a window of the map from above. */
   frame(row, col, height, width) {
     const { head } = this, side = Math.max(head.height, head.width), camera = this.cameras.map;
@@ -142,9 +164,10 @@ class Terrain {
     return this.cameras.space.position.clone().divideScalar(this.scale);
   }
 
-  /** Scene units on the map per pixel of the screen */
+  /** Scene units per pixel of the screen; in space, at what the camera looks at */
   unitsPerPixel() {
-    const camera = this.cameras.map;
+    const { map: camera, space } = this.cameras, away = space.position.distanceTo(this.controls.space.target);
+    if (this.view === "space") return (2 * away * Math.tan((space.fov * Math.PI) / 360)) / this.renderer.domElement.clientHeight;
     return (camera.right - camera.left) / camera.zoom / this.renderer.domElement.clientWidth;
   }
 
