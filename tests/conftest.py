@@ -32,6 +32,7 @@ FIRST = (
     "test_malformed",
     "test_simulate_scene",
     "test_view_browser",
+    "test_view_controls",
 )
 
 

@@ -125,7 +125,7 @@ def _robust(columns: NDArray[np.float64], wanted: NDArray[np.float64], calm: NDA
 
 
 def _correlation(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
-    return float(a @ b / max(np.sqrt((a @ a) * (b @ b)), 1e-30))
+    return float(a @ b) / max(float(np.sqrt((a @ a) * (b @ b))), 1e-30)
 
 
 def spread_step(values: NDArray, known: NDArray[np.bool_], levels: int) -> float:

@@ -24,7 +24,7 @@ PHOTOGRAPH_LEVELS = 256  # steps of its range
 # Of maps that no picture is made of: steps of the range, and pixels along each side of a block whose mean is kept.
 OTHER_LEVELS, OTHER_BLOCK = 64, 3
 SCRIPTS = (
-    "decode.js", "ground.js", "coarse.js", "shadows.js", "relight.js", "terrain.js", "panel.js", "photographs.js", "overlay.js", "address.js",
+    "decode.js", "ground.js", "coarse.js", "shadows.js", "relight.js", "terrain.js", "panel.js", "photographs.js", "overlay.js", "address.js", "hooks.js",
     "main.js",
 )  # fmt: skip
 SAME = 1e-6  # relative: what varies less is the same everywhere

@@ -39,7 +39,7 @@ async function main() {
   relighter.setLight(app.light());
   relighter.read(0, 0, 1, 1);  // shaders are made now: how long a picture takes is measured next
   app.drawNow();
-  window.lunargr = { able: true, state, head, ...app.hooks() };
+  window.lunargr = { able: true, state, head, ...makeHooks(app) };
   document.documentElement.dataset.lunargr = "ready";
 }
 
@@ -312,42 +312,6 @@ class App {
   rows(row, col) {
     const found = pixelRows(this.head, this.page, this.relighter, this.terrain.ground, row, col), measured = this.photographs.at(row, col);
     return measured > -Infinity ? [...found, ["Measured", short(measured)]] : found;
-  }
-
-  /** For tests and for the curious: the page's own numbers */
-  hooks() {
-    const set = (parts) => {
-      if ("layer" in parts && typeof parts.layer === "string") parts = { ...parts, layer: this.relighter.layers.findIndex((l) => l.name === parts.layer) };
-      this.change(parts);
-      this.drawNow();
-    };
-    return {
-      set,
-      /** I/F of the whole map under a Sun; camera: [m, m, m] in the axes of the map's middle, or from straight above */
-      pixels: ({ azimuth, elevation, shadows = true, camera = null }) => {
-        this.relighter.setLight({ sun: sunVector(this.head, azimuth, elevation), shadows, camera: camera && new THREE.Vector3(...camera) });
-        const image = this.relighter.image();
-        this.drawn = null;
-        this.ask();
-        return image;
-      },
-      photograph: (k) => (this.photograph(k), this.drawNow()),
-      pick: (x, y) => this.terrain.pick(x, y),
-      values: (row, col) => this.rows(row, col),
-      pose: () => this.terrain.pose(),
-      frames: this.frames,
-      /** Frames per second over some frames, the Sun (or else the camera) turning, each frame waited for */
-      rate: (frames, turning = "sun", coarse = false) => {
-        const start = performance.now();
-        for (let k = 0; k < frames; k++) {
-          if (turning === "sun") state.azimuth = (state.azimuth + 2) % 360;
-          else this.terrain.cameras.space.position.x += 0.01;
-          this.drawNow(coarse);
-          this.terrain.wait();
-        }
-        return (1000 * frames) / (performance.now() - start);
-      },
-    };
   }
 }
 
