@@ -12,9 +12,9 @@ from stages.diagnose.judge.claim import Claim, decide
 from stages.diagnose.judge.refine import error_of_rms
 from stages.diagnose.judge.state import State
 from stages.diagnose.likelihood.columns import Guise
-from stages.diagnose.likelihood.weigh import family_wise, weigh
+from stages.diagnose.likelihood.weigh import Found, family_wise, weigh
 from stages.diagnose.likelihood.whole import Whole
-from stages.diagnose.sources.search import Outcome, held_out
+from stages.diagnose.sources.search import Outcome, held_out, rivals_of
 from stages.effects import effect_names, get_effect
 
 
@@ -59,16 +59,20 @@ def _injected(state: State, out: Outcome, guise: Guise, amount: Floats) -> Claim
     """The claim of the effect where so much of it is added to the residuals."""
     cls, places = get_effect(guise.effect), out.view.whole.places(guise)
     whole = out.view.whole.with_added(places, amount)
-    found, _ = weigh(whole, guise)
-    p = family_wise(found.surprise, out.largest)
+    found = _weighed(whole, guise, out)
+    p = found.p
     gains, units = held_out(whole, found)
+    others = {n: _weighed(whole, out.best[n].guise, out) for n in out.open_rivals(guise.effect)}
+    rivals = rivals_of(whole, found, others, {})
     if guise.per_frame:
         size = cls.size(cls.strong)
         covariance = np.diag(found.error**2)
         rms = math.sqrt(float((found.amount**2 + found.error**2).mean()))
         error = error_of_rms(found.amount, covariance, rms, len(places))
         sizes = dict.fromkeys([*cls.tolerance, "rms"], (rms * size, error * size))
-        return Claim(cls({}, state.data), sizes, gains, units, rms / max(error, 1e-30), 1, p)
+        return Claim(
+            cls({}, state.data), sizes, gains, units, rms / max(error, 1e-30), 1, p, rivals=rivals, values=found.values
+        )
     moves, errors, covariance = whole.errors(places, whole.exclude(guise))
     wider = max(float((errors**2 / np.maximum(covariance.diagonal(), 1e-30)).mean()), 1.0)
     away = math.sqrt(max(float(moves @ np.linalg.pinv(covariance, rcond=1e-9, hermitian=True) @ moves), 0.0) / wider)
@@ -81,7 +85,14 @@ def _injected(state: State, out: Outcome, guise: Guise, amount: Floats) -> Claim
                 float(error) * away_from_nothing, min(state.law, 1.0) * cls.law_error.get(name, 0.0)
             )
     sizes = {k: (abs(v - cls.null().get(k, 0.0)), e) for k, (v, e) in cls.report(values, known).items()}
-    return Claim(cls(values, state.data), sizes, gains, units, away, len(moves), p)
+    return Claim(cls(values, state.data), sizes, gains, units, away, len(moves), p, rivals=rivals, values=found.values)
+
+
+def _weighed(whole: Whole, guise: Guise, out: Outcome) -> Found:
+    """The evidence for a guise, with its family-wise p."""
+    found, _ = weigh(whole, guise)
+    found.p = family_wise(found.surprise, out.largest)
+    return found
 
 
 __all__ = ["blind_effects"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -31,6 +31,12 @@ class Outcome:
     refused: dict[str, Refusal] = field(default_factory=dict)
     ordinary: dict[str, Cause] = field(default_factory=dict)
     strange: bool = False
+
+    def open_rivals(self, effect: str) -> list[str]:
+        """What passes for an effect, without what these data exclude. What the law's departures follow gains in their place, not beside them."""
+        excluded = (Reason.IMPOSSIBLE, Reason.ORDINARY, Reason.ANOTHER_LAW)
+        names = [n for n in get_effect(effect).confused_with if n in self.best]
+        return [n for n in names if n not in self.refused or self.refused[n].reason not in excluded]
 
 
 def search(state: State, most: int) -> Outcome:
@@ -141,30 +147,37 @@ def held_out(whole: Whole, found: Found) -> tuple[Floats, Floats]:
     return gains, whole.power(places, found.amount) if get_effect(found.effect).lights_shadows else whole.sizes
 
 
+def rivals_of(
+    whole: Whole, found: Found, others: Mapping[str, Found], gains: dict[str, tuple[Floats, Floats]]
+) -> list[Rival]:
+    """What else explains the same: of ``others`` those with evidence, the same on the other side, another law. gains : known ones by name
+
+    What is part of the nuisance as large as it is in these data is none: an effect gains beside it.
+    """
+    rivals = []
+    for name, other in others.items():
+        beside = get_effect(name).scatters and not found.levels
+        if other.p <= DISCOVERY and not beside:
+            if name not in gains:
+                gains[name] = held_out(whole, other)
+            rivals.append(Rival(name, gains[name][0], other.values))
+    if mirrored := whole.mirrored(found.guise):
+        same = whole.held_out(whole.places(mirrored), whole.exclude(mirrored))
+        rivals.append(Rival("the same on the other side", same, 0))
+    if get_effect(found.effect).of_law and len(whole.form_places()):
+        rivals.append(Rival("", whole.law_gains(whole.ordinary_places(found.effect)), len(whole.form_places())))
+    return rivals
+
+
 def _first(
     state: State, whole: Whole, found: Found, gains: dict[str, tuple[Floats, Floats]], out: Outcome
 ) -> tuple[Cause, list[Rival]]:
-    """The effect at its first estimate, with the rivals that its file declares and these data do not exclude."""
-    cls = get_effect(found.effect)
-    rivals = []
-    for name in cls.confused_with:
-        other = out.best.get(name)
-        refused = out.refused.get(name)
-        if other is None or other.p > DISCOVERY or (refused and refused.reason in (Reason.IMPOSSIBLE, Reason.ORDINARY)):
-            continue
-        if name not in gains:
-            gains[name] = held_out(whole, other)
-        rivals.append(Rival(name, gains[name][0], other.values))
-    if mirrored := whole.mirrored(found.guise):
-        rivals.append(
-            Rival("the same on the other side", whole.held_out(whole.places(mirrored), whole.exclude(mirrored)), 0)
-        )
-    if cls.of_law and len(whole.form_places()):
-        rivals.append(Rival("", whole.law_gains(whole.ordinary_places(found.effect)), len(whole.form_places())))
+    """The effect at its first estimate, with its rivals."""
+    rivals = rivals_of(whole, found, {n: out.best[n] for n in out.open_rivals(found.effect)}, gains)
     own, units = gains[found.effect]
     effect = as_effect(found, state.data, state.frames, whole)
     cause = Cause(effect, found, own, units)
-    cause.group = [found.effect, *(r.name for r in rivals if r.name in cls.confused_with)]
+    cause.group = [found.effect, *(r.name for r in rivals if r.name in type(effect).confused_with)]
     return cause, rivals
 
 
