@@ -97,7 +97,7 @@ def _deflated(folded: NDArray[np.int64], share: int) -> bytes:
     digits = np.pad(np.minimum(folded, top), (0, -len(folded) % share)).reshape(-1, share)
     first = digits @ (top + 1) ** np.arange(share)
     more = (folded[folded >= top] - top).astype("<u4").view(np.uint8).reshape(-1, 4).T
-    deflate = zlib.compressobj(6, strategy=zlib.Z_FILTERED)
+    deflate = zlib.compressobj(6, memLevel=9, strategy=zlib.Z_FILTERED)
     return deflate.compress(first.astype(np.uint8).tobytes() + more.tobytes()) + deflate.flush()
 
 

@@ -68,7 +68,7 @@ class App {
     const sun = Object.entries({ azimuth, elevation }).filter(([, value]) => value !== undefined);
     if (photograph !== null) this.photograph(photograph, false);  // with its own Sun
     else this.letGo(), Object.assign(state, Object.fromEntries(sun));
-    this.change(parts, false);
+    this.change({ auto: true, ...parts }, false);
     if (pose) this.terrain.setPose(pose);
   }
 
@@ -230,7 +230,7 @@ class App {
     else if (key !== this.drawn) {
       this.drawn = key;
       terrain.wait();
-      this.slow = performance.now() - start > SLOW_MS;
+      this.slow = performance.now() - start > SLOW_MS && Math.max(this.head.width, this.head.height) > 2 * COARSE_PX;
     }
     this.panel.contrast(state.limits, layer.colours);
     this.panel.scaleBar(terrain.unitsPerPixel(), state.view === "space");
