@@ -1,5 +1,5 @@
 """refine: heights and albedo together, from all photographs of a place. stage: from files to files; learn: spectra and noise;
-judge: whether images left out gain; patch: photographs beside the map; solve: the posterior; spectrum: fields by frequency.
+judge: whether images left out gain; patch: photographs beside the map; solve: the posterior.
 """
 
 from __future__ import annotations

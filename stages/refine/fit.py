@@ -7,9 +7,9 @@ from collections.abc import Collection
 import numpy as np
 
 from stages.common.arrays import Floats32
+from stages.physics.images.spectrum import collect, smoothed, waves
 from stages.refine.patch import Evidence, Noise, Patch
 from stages.refine.solve import Posterior, Priors, unresolved
-from stages.refine.spectrum import collect, smoothed, waves
 
 ROUNDS = 3
 
@@ -32,7 +32,9 @@ def variances(
 ) -> Floats32:
     """(2, H, W) of heights, m2, and of log albedo for an image under other angles, from draws of the posterior."""
     wider = np.sqrt(priors.widening.of(posterior.shape))
-    squares = sum(collect(wider * waves(posterior.draw(rng))) ** 2 for _ in range(draws))
+    squares = np.zeros_like(wider)
+    for _ in range(draws):
+        squares += collect(wider * waves(posterior.draw(rng))) ** 2
     found = np.stack([smoothed(s) for s in squares]) / np.float32(draws)
     found += np.array(unresolved(priors), np.float32)[:, None, None]
     found[1] += evidence.doubt

@@ -21,6 +21,7 @@ from stages.photographs.ground import Ground
 from stages.photographs.intervals import unseen_widths
 from stages.photographs.posterior import estimate, robust_mean
 from stages.photographs.prior import terrain_variance
+from stages.physics.images.spectrum import WAVELENGTHS, Spectrum, by_wavelength, waves
 from stages.physics.images.windows import WINDOW_PX, choose_windows
 from stages.physics.maps.window import Box, Window
 from stages.physics.terrain.surface import SHADOWED
@@ -28,7 +29,6 @@ from stages.refine.fit import fit, variances
 from stages.refine.learn import SEED, learn
 from stages.refine.patch import Noise, Patch
 from stages.refine.solve import FIELDS, Priors
-from stages.refine.spectrum import WAVELENGTHS, Spectrum, by_wavelength, waves
 
 WINDOWS = 16
 MARGIN_PX = 16  # around windows: read, and not judged

@@ -15,9 +15,9 @@ from scipy.optimize import nnls
 
 from stages.common.arrays import Floats, Floats32
 from stages.common.progress import Progress, show_nothing
+from stages.physics.images.spectrum import WAVELENGTHS, Spectrum, by_wavelength, waves
 from stages.refine.patch import Noise, Patch, Residual
 from stages.refine.solve import FIELDS, Posterior, Priors
-from stages.refine.spectrum import WAVELENGTHS, Spectrum, by_wavelength, waves
 
 ROUNDS = 7
 REFRESHED = (2, 4)  # rounds before which horizons are taken anew
@@ -98,7 +98,7 @@ def _updated(priors: Priors, sums: Sums) -> Priors:
     before = priors.trust.variance
     free = np.maximum(1 - sums.fitted * before / np.maximum(sums.white, 1e-30), LEAST_SHARE)
     now = free * sums.white / np.maximum(sums.left, 1e-30)
-    return Priors(*spectra, Spectrum(np.clip(np.clip(now, before / STEP, before * STEP), *TRUST)))
+    return Priors(spectra[0], spectra[1], Spectrum(np.clip(np.clip(now, before / STEP, before * STEP), *TRUST)))
 
 
 def _bounded(variance: Floats, told: Floats, longest: float) -> Floats:

@@ -19,8 +19,8 @@ import numba
 import numpy as np
 
 from stages.common.arrays import Floats32
+from stages.physics.images.spectrum import WAVELENGTHS, Spectrum, collect, frequencies, waves
 from stages.refine.patch import BROAD_PX
-from stages.refine.spectrum import WAVELENGTHS, Spectrum, collect, frequencies, waves
 
 ITERATIONS = 80
 TOLERANCE = 1e-3  # of the residual's norm, preconditioned

@@ -31,6 +31,7 @@ from stages.common.runner.stage import as_geotiff
 from stages.photographs.calibrate import read_calibration, write_calibration
 from stages.photographs.copying import copy_map, kept_attributes, sizes_of
 from stages.photographs.ground import Ground, open_ground
+from stages.physics.images.spectrum import WAVELENGTHS
 from stages.physics.maps.geotiff import write_geotiff
 from stages.physics.maps.grid import read_grid
 from stages.physics.maps.window import Box, Window
@@ -40,7 +41,6 @@ from stages.refine.fit import fit, variances
 from stages.refine.judge import Learned, find_out
 from stages.refine.learn import SEED
 from stages.refine.patch import Patch
-from stages.refine.spectrum import WAVELENGTHS
 
 HALO_PX = 64
 STACK_PX = 12 << 20  # pixels of all images of a block: 0.6 GB

@@ -9,7 +9,7 @@ from markupsafe import Markup
 from schemas import read_strings
 from stages.common import page
 from stages.common.page import pictures
-from stages.refine.spectrum import by_wavelength, waves
+from stages.physics.images.spectrum import by_wavelength, waves
 from stages.report.maps import draw_map, svbrdf
 
 WINDOW = 256  # px, of the pair before and after
@@ -33,8 +33,8 @@ def _relief(file: h5py.File) -> list[Markup]:
     part = _window(file)
     after, change = (file[name][part].astype(float) for name in ("elevation", "elevation_correction"))
     limits = pictures.limits(_lit(after), 0.5)
-    sides = [pictures.photo_uri(pictures.coloured(_lit(v), *limits, "gray")) for v in (after - change, after)]
-    pair = page.slider(*sides, ("DEM", "refined"), f"Slopes towards the north-west, {change.shape[1]} px wide")
+    dem, new = (pictures.photo_uri(pictures.coloured(_lit(v), *limits, "gray")) for v in (after - change, after))
+    pair = page.slider(dem, new, ("DEM", "refined"), f"Slopes towards the north-west, {change.shape[1]} px wide")
     maps = [
         draw_map(file, pictures.read_thinned(file[name])[0].astype(float), title, "m", colours)
         for name, title, colours in (
