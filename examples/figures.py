@@ -8,15 +8,16 @@ from __future__ import annotations
 
 import csv
 import json
-import math
 import re
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT))
+sys.path[:0] = [str(ROOT), str(ROOT / "examples")]
+
+from figure_text import gained, percent, power_of, ssim, table, unit_of, with_bounds  # noqa: E402
 
 from stages.common.page.sentences import basis, counted, listed, words  # noqa: E402
 from stages.report.held_out import TITLES as MAPS  # noqa: E402
@@ -49,45 +50,6 @@ def read(root: Path, name: str, command: str) -> dict[str, Any]:
         return json.loads((root / name).read_text())
     except FileNotFoundError:
         raise Absent(name, command) from None
-
-
-def table(columns: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
-    columns = list(columns)
-    return ["", *(f"|{'|'.join(row)}|" for row in (columns, ["---"] * len(columns), *rows)), ""]
-
-
-def power_of(rows: Iterable[dict[str, Any]]) -> int:
-    """The power of ten that all errors of a table are given in: that of the row in the middle."""
-    errors = sorted(row["mse"] for row in rows if row["mse"] > 0)
-    return math.floor(math.log10(errors[len(errors) // 2])) if errors else 0
-
-
-def number(value: float) -> str:
-    """Three digits, never as a power of ten."""
-    return f"{value:.3g}" if value >= 100 else f"{value:#.3g}".removesuffix(".")
-
-
-def with_bounds(value: float, low: float | None, high: float | None, spread: float | None, power: int) -> str:
-    """'7.95 ± 0.12 (5.78 to 12.2)' in units of ten to the ``power``."""
-    text = number(value / 10**power)
-    if spread is not None:
-        text += f" ± {spread / 10**power:.{len(text.partition('.')[2])}f}"
-    if low is None:
-        return f"{text} (no interval)"
-    return f"{text} ({number(low / 10**power)} to {'unbounded' if high is None else number(high / 10**power)})"
-
-
-def percent(value: float, low: float, high: float) -> str:
-    return f"{value:.1f} % ({low:.1f} to {high:.1f})"
-
-
-def ssim(row: dict[str, Any]) -> str:
-    return "-" if row.get("ssim") is None else f"{row['ssim']:.3f}"
-
-
-def unit_of(result: dict[str, Any], power: int) -> str:
-    unit = "I/F squared" if result["image_units"] == "iof" else "of the full DN range squared"
-    return f"MSE, 1e{power} {unit}" if power else f"MSE, {unit}"
 
 
 def evaluated(result: dict[str, Any], more: dict[str, Any] | None = None) -> list[str]:
@@ -212,17 +174,17 @@ def diagnosed(root: Path, folder: str, command: str) -> list[str]:
     return lines
 
 
-def apollo15(root: Path) -> list[str]:
-    return evaluated(read(root, "results/apollo15/evaluation.json", APOLLO))
-
-
-def gained(gain: dict[str, Any], over: str) -> str:
-    """'25.3 % lower (11.4 to 37.0) than ...', no stronger than the interval allows."""
-    value, low, high = (gain[f"gain_percent{end}"] for end in ("", "_low", "_high"))
-    if low is None or high is None or low <= 0 <= high:
-        interval = "no interval" if low is None or high is None else f"{low:.1f} to {high:.1f}"
-        return f"no sure difference from {over}: gain {value:.1f} % ({interval})"
-    return f"{percent(abs(value), *sorted((abs(low), abs(high))))} {'lower' if value > 0 else 'higher'} than {over}"
+def brief(root: Path, folder: str) -> list[str]:
+    """What an evaluation rests on and its conclusions, without the table that its report has."""
+    result = read(root, f"{folder}/evaluation.json", APOLLO)
+    notes = [f"- Note: {text}." for text in result.get("warnings", [])]
+    return [
+        f"Model {result['model']}; {basis(result)}. Brackets hold 95 % intervals.",
+        "",
+        *won(result),
+        *covered(result),
+        *notes,
+    ]
 
 
 def three_results(root: Path) -> list[str]:
@@ -411,7 +373,8 @@ BLOCKS: dict[str, Callable[[Path], list[str]]] = {
     "demo-albedo-match": lambda root: matched(root, "demo-full/match_albedo.json", ALBEDO),
     "demo-match": lambda root: matched(root, "demo-full/match.json", DEMO),
     "demo-diagnosis": lambda root: diagnosed(root, "demo-full", DEMO),
-    "apollo15": apollo15,
+    "apollo15": lambda root: brief(root, "results/apollo15"),
+    "apollo15-cubes": lambda root: brief(root, "results/apollo15_cubes"),
     "apollo15-held-out": lambda root: held_out(root, "results/apollo15/held_out.json", APOLLO),
     "apollo15-diagnosis": lambda root: diagnosed(root, "results/apollo15", APOLLO),
     "models": models,
