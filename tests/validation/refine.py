@@ -126,7 +126,7 @@ def score(folder: Path, case: str) -> dict[str, object]:
         case == "complete"
     ):  # as if the heights were all false: their shading under a Sun at 45 deg over the albedo's contrast
         east = (h[:, 2:] - h[:, :-2])[known[:, 1:-1]] / 10.0
-        row["relief_from_albedo_percent"] = round(float(100 * east.std() / np.std(np.log(alone)[seen])), 2)
+        row["relief_from_albedo_percent"] = round(float(100 * np.nanstd(east) / np.std(np.log(alone)[seen])), 2)
     return row
 
 
@@ -154,9 +154,8 @@ def photoclinometry(folder: Path) -> dict[str, object]:
     ground = np.where(known, dem, dem[known].mean()).astype(float)
     images = [resampled(folder, k, dem.shape) for k in used]
     vectors = [[direction(angles[0][k], angles[1][k]), direction(angles[2][k], angles[3][k])] for k in used]
-    best = min(
-        (solve(ground, images, vectors, w) for w in WEIGHTS), key=lambda h: in_band(truth - ground - h, known, (3, 8))
-    )
+    tried = [h for h in (solve(ground, images, vectors, w) for w in WEIGHTS) if np.isfinite(h).all()]
+    best = min(tried, key=lambda h: in_band(truth - ground - h, known, (3, 8)))
     return {
         f"photoclinometry_percent_{low}_{high}px": round(
             100 * (in_band(truth - ground - best, known, (low, high)) / in_band(truth - ground, known, (low, high)) - 1), 1
