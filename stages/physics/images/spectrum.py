@@ -85,7 +85,7 @@ def waves(fields: Floats32) -> Floats32:
 
 
 def collect(coefficients: Floats32) -> Floats32:
-    """The inverse of :func:`waves`."""
+    """The inverse of :func:`waves`: (..., H, W) coefficients -> fields."""
     return np.asarray(fft.idctn(coefficients, axes=(-2, -1), norm="ortho"), np.float32)
 
 
