@@ -51,7 +51,8 @@ def open_raster(path: Path, what: str = "a raster", band: str = "") -> Iterator[
         open_hdf5(Path(path)).close()
     try:
         dataset = open_raster_file(Path(path))
-        if dataset.count > 1 and dataset.descriptions.count(band) == 1:
+        # GDAL takes what follows a question mark for options
+        if dataset.count > 1 and dataset.descriptions.count(band) == 1 and "?" not in str(path):
             dataset.close()
             dataset = rasterio.open(f"vrt://{path}?bands={dataset.descriptions.index(band) + 1}")
     except RasterioIOError as error:
