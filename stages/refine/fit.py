@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 
 import numpy as np
 
 from stages.common.arrays import Floats32
-from stages.physics.images.spectrum import collect, smoothed, waves
+from stages.physics.images.spectrum import collect, smoothed
 from stages.refine.patch import Evidence, Noise, Patch
 from stages.refine.solve import Posterior, Priors, unresolved
 
@@ -27,15 +27,16 @@ def fit(
     return fields, posterior, evidence
 
 
-def variances(
-    posterior: Posterior, evidence: Evidence, priors: Priors, draws: int, rng: np.random.Generator
-) -> Floats32:
-    """(2, H, W) of heights, m2, and of log albedo for an image under other angles, from draws of the posterior."""
-    wider = np.sqrt(priors.widening.of(posterior.shape))
-    squares = np.zeros_like(wider)
-    for _ in range(draws):
-        squares += collect(wider * waves(posterior.draw(rng))) ** 2
-    found = np.stack([smoothed(s) for s in squares]) / np.float32(draws)
+def variances(priors: Priors, draws: Iterable[Floats32], doubt: Floats32) -> Floats32:
+    """(2, H, W) of heights, m2, and of log albedo for an image under other angles.
+
+    draws : waves (2, H, W) of draws of the posterior; doubt : see ``Evidence``
+    """
+    squares, count, wider = np.zeros((2, *doubt.shape), np.float32), 0, np.sqrt(priors.widening.of(doubt.shape))
+    for draw in draws:
+        squares += collect(wider * draw) ** 2
+        count += 1
+    found = np.stack([smoothed(s) for s in squares]) / np.float32(count)
     found += np.array(unresolved(priors), np.float32)[:, None, None]
-    found[1] += evidence.doubt
+    found[1] += doubt
     return found

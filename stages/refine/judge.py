@@ -1,14 +1,14 @@
-"""Whether heights help: each image left out in turn, predicted by the others with and without them, on the same windows.
+"""Whether heights help: images left out in turn, predicted by the others with and without them, on the same windows.
 
-The map without heights is that of ``lunargr albedo`` from the same images. Squared errors are compared window by window;
-the correction counts if the 95 % interval of its gain lies above zero.
+Without them: the same posterior with the DEM's heights, and the map of ``lunargr albedo``. Squared errors are compared
+window by window; the correction counts if the 95 % intervals of its gain over both lie above zero.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -75,29 +75,47 @@ class Learned:
 
 @dataclass
 class Scores:
-    """Of pairs of window and image left out. ours, other : sums of squared errors with and without heights; unit : of ground
+    """Sums of squared errors of pairs of window and image left out: with heights, with those of the DEM, of ``lunargr albedo``.
 
-    residual, place, image : (N,) of pixels, for the intervals
+    unit : of ground
     """
 
-    ours: list[float]
-    other: list[float]
-    unit: list[tuple[int, ...]]
-    residual: list[Floats32]
-    place: list[Any]
-    image: list[Any]
+    refined: list[float] = field(default_factory=list)
+    held: list[float] = field(default_factory=list)
+    albedo: list[float] = field(default_factory=list)
+    unit: list[tuple[int, ...]] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Pixels (N,) of image ``k``, left out. at : in the window, row by row; residual, image : measured and predicted I/F
+
+    place : bin of the cosine of incidence, the last one shadow; least : I/F, standard deviation in shadow
+    """
+
+    k: int
+    at: Any
+    residual: Floats32
+    image: Floats32
+    place: Any
+    least: float
 
 
 @dataclass(frozen=True)
 class Turn:
-    """Waves (2, H, W) of what the images found without some, of a draw about it, and of what noise alone did to it."""
+    """What the images found without some: waves (2, H, W) of it, of a draw about it, and of what noise alone did to it.
+
+    doubt : see ``Evidence``
+    """
 
     found: Floats32
     draw: Floats32
     noise: Floats32
+    doubt: Floats32
+    judged: list[Judged]
 
 
-class Turns:
+class Widening:
     """How much more what images find differs with the choice of images than their noise says: the jackknife (Tukey 1958) by wavelength."""
 
     def __init__(self) -> None:
@@ -115,7 +133,7 @@ class Turns:
                 self._more[k] += by_wavelength(more) * (count - 1) / count
                 self._drawn[k] += by_wavelength(turn.draw[k] ** 2) / count
 
-    def widening(self) -> Spectrum:
+    def spectrum(self) -> Spectrum:
         """(2, K) factors of the variances of heights and log albedo."""
         return Spectrum(1 + np.maximum(self._more, 0) / np.maximum(self._drawn, 1e-30))
 
@@ -128,18 +146,19 @@ def find_out(ground: Ground, form: str | None, progress: Progress = show_nothing
     boxes = [Window(*box).padded(MARGIN_PX, shape) for box in windows]
     patches = [Patch(ground, calibration, box) for box in boxes]
     priors, noise, _ = learn(patches, *_start(patches, calibration), progress)
-    scores, turns = Scores([], [], [], [], [], []), Turns()
+    scores, turns, widening = Scores(), [], Widening()
     folds = min(FOLDS, count)
     for number, (patch, window) in enumerate(zip(patches, windows, strict=True)):
-        found = []
+        mine = []
         for fold in range(folds if count > 1 else 0):
             progress(number * folds + fold, len(windows) * folds, "images left out")
             left = {k for k in range(count) if k % folds == fold}
-            found += _score(scores, ground, calibration, patch, window, (priors, noise), left)
-        turns.add(found)
-    priors = replace(priors, widening=turns.widening())
+            mine += _score(scores, ground, calibration, patch, window, (priors, noise), left)
+        widening.add(mine)
+        turns += mine
+    priors = replace(priors, widening=widening.spectrum())
     gain, reason = _decide(scores, len(windows), count)
-    return Learned(_with_intervals(calibration, scores), priors, noise, gain, reason)
+    return Learned(_with_intervals(calibration, priors, turns), priors, noise, gain, reason)
 
 
 def _start(patches: Sequence[Patch], calibration: Calibration) -> tuple[Priors, Noise]:
@@ -163,43 +182,40 @@ def _score(
         return []
     priors, noise = learned
     patch.refresh(None)
-    plain = patch.start(used)
-    fields = plain.copy()
-    plain[1] = _shared_albedo(ground, calibration, patch, used)
-    without = [patch.predict(p, plain).image for p in tested]
-    fields, posterior, evidence = fit(patch, fields, priors, noise, used)
+    start = patch.start(used)
+    alone = np.stack([start[0], _shared_albedo(ground, calibration, patch, used)])
+    held, _, _ = fit(patch, start, replace(priors, heights=Spectrum(np.zeros(len(WAVELENGTHS)))), noise, used)
+    without = [[patch.predict(p, fields).image for fields in (held, alone)] for p in tested]
+    fields, posterior, evidence = fit(patch, start, priors, noise, used)
     rng = np.random.default_rng([SEED, *window[:2], min(left)])
-    turn = Turn(*(waves(x) for x in (fields, posterior.draw(rng), posterior.draw(rng, prior=False))))
-    std = np.sqrt(variances(posterior, evidence, priors, 1, rng)[1])
-    own = float(np.median(calibration.spread.own.sum(axis=1)))
+    found = (waves(x) for x in (fields, posterior.draw(rng), posterior.draw(rng, prior=False)))
+    turn = Turn(*found, evidence.doubt, [])
     judged, others = Window(*window).within(patch.box), np.zeros(patch.shape, np.uint8)
     for photograph in patch.photographs:
         if photograph.k in used:
             others[photograph.box.within(patch.box).part] += np.isfinite(photograph.measured)
+    at = np.arange(others.size).reshape(others.shape)
     for photograph, before in zip(tested, without, strict=True):
-        found, box = patch.predict(photograph, fields), photograph.box.within(patch.box)
+        predicted, box = patch.predict(photograph, fields), photograph.box.within(patch.box)
         known = np.zeros(box[2:], bool)
         known[max(0, judged.row - box.row) : max(0, judged.row + judged.height - box.row),
               max(0, judged.col - box.col) : max(0, judged.col + judged.width - box.col)] = True  # fmt: skip
-        known &= np.isfinite(before) & np.isfinite(found.image) & np.isfinite(photograph.measured)
+        known &= np.isfinite(photograph.measured) & np.isfinite([predicted.image, *before]).all(axis=0)
         known &= others[box.part] > 1  # one image tells neither heights nor albedo
         # as one who has not seen it takes it: a calibrated image has no gain of its own
         measured = photograph.measured * np.float32(calibration.gain[photograph.k] if ground.units == "iof" else 1)
-        errors = [np.where(known, (v - measured) ** 2, 0) for v in (found.image, before)]
+        errors = [np.where(known, (v - measured) ** 2, 0) for v in (predicted.image, *before)]
         for part, corner in _quarters(box, judged):
-            sums = [float(e[part].sum(dtype=float)) for e in errors]
             if known[part].any():
-                scores.ours.append(sums[0])
-                scores.other.append(sums[1])
+                for sums, e in zip((scores.refined, scores.held, scores.albedo), errors, strict=True):
+                    sums.append(float(e[part].sum(dtype=float)))
                 scores.unit.append((*window[:2], *corner))
-        shadow = found.shadow > SHADOWED
-        unit = np.sqrt(std[box.part] ** 2 + own) * np.abs(found.image)
-        unit = np.where(shadow, max(photograph.sun_sine(ground.references.surface.grid), 1e-3), unit)
-        use = known & (unit > 0)
-        place = np.clip(np.digitize(found.cosine, COSINES) - 1, 0, len(COSINES) - 2)
-        scores.place.append(np.where(shadow, len(COSINES) - 1, place)[use][::THINNED])
-        scores.residual.append((np.sqrt(errors[0])[use] / unit[use])[::THINNED].astype(np.float32))
-        scores.image.append(np.full(len(scores.place[-1]), photograph.k, np.intp))
+        place = np.clip(np.digitize(predicted.cosine, COSINES) - 1, 0, len(COSINES) - 2)
+        place = np.where(predicted.shadow > SHADOWED, len(COSINES) - 1, place)
+        pixels = (v[known][::THINNED] for v in (at[box.part], np.sqrt(errors[0]), predicted.image, place))
+        turn.judged.append(
+            Judged(photograph.k, *pixels, max(photograph.sun_sine(ground.references.surface.grid), 1e-3))
+        )
     patch.refresh(None)
     return [turn]
 
@@ -228,31 +244,43 @@ def _decide(scores: Scores, windows: int, count: int) -> tuple[tuple[float, floa
     """The gain with its interval, and why the heights stay, empty where they do not."""
     if count < 2:
         return (math.nan,) * 3, "one image: none is left to judge by"
-    if not scores.ours:
+    if not scores.unit:
         return (math.nan,) * 3, "no two images show the same ground"
     corners = np.array(scores.unit)
     names = corners[:, :2] if windows >= ENOUGH else corners
     unit = np.unique(names, axis=0, return_inverse=True)[1].ravel()
-    gain = gain_interval(np.array(scores.ours), np.array(scores.other), unit)
-    found = gain.value, gain.low, gain.high
-    if not math.isfinite(gain.low):
-        return found, "too little ground to judge by"
-    if gain.low > 0:
-        return found, ""
-    return found, (
-        f"images left out gain {gain.value:+.1f} % ({gain.low:+.1f} to {gain.high:+.1f}), not surely more than nothing"
+    heights, all_of_it = (
+        gain_interval(np.array(scores.refined), np.array(v), unit) for v in (scores.held, scores.albedo)
     )
+    found = all_of_it.value, all_of_it.low, all_of_it.high
+    for gain, what in ((heights, "heights"), (all_of_it, "heights and albedo")):
+        if not math.isfinite(gain.low):
+            return found, "too little ground to judge by"
+        if not gain.low > 0:
+            return found, (
+                f"images left out gain {gain.value:+.1f} % by {what} ({gain.low:+.1f} to {gain.high:+.1f}), "
+                "not surely more than nothing"
+            )
+    return found, ""
 
 
-def _with_intervals(calibration: Calibration, scores: Scores) -> Calibration:
+def _with_intervals(calibration: Calibration, priors: Priors, turns: Sequence[Turn]) -> Calibration:
     """The calibration with intervals of the images left out, where there are any."""
-    if not scores.residual:
+    own, units, seen = float(np.median(calibration.spread.own.sum(axis=1))), [], []
+    for turn in turns:
+        variance = variances(priors, [turn.draw], turn.doubt)[1].ravel() + own
+        for j in turn.judged:
+            units.append(np.where(j.place == len(COSINES) - 1, j.least, np.sqrt(variance[j.at]) * np.abs(j.image)))
+            seen.append(j)
+    if not seen:
         return calibration
-    residual, place, image = (np.concatenate(v) for v in (scores.residual, scores.place, scores.image))
-    bins, lit = len(COSINES) - 1, place < len(COSINES) - 1
+    unit, place = np.concatenate(units), np.concatenate([j.place for j in seen])
+    residual, image = (np.concatenate(v) for v in ([j.residual for j in seen], [np.full(len(j.at), j.k) for j in seen]))
+    bins = len(COSINES) - 1
+    lit, dark = (unit > 0) & (place < bins), (unit > 0) & (place == bins)
     interval, shadow = calibration.interval, calibration.shadow
     if lit.any():
-        interval = unseen_widths(residual[lit], place[lit], image[lit], bins)
-        if not lit.all():
-            shadow = unseen_widths(residual[~lit], place[~lit] - bins, image[~lit], 1)[:, 0]
+        interval = unseen_widths(residual[lit] / unit[lit], place[lit], image[lit], bins)
+    if lit.any() and dark.any():
+        shadow = unseen_widths(residual[dark] / unit[dark], place[dark] - bins, image[dark], 1)[:, 0]
     return replace(calibration, interval=interval, shadow=shadow)

@@ -28,8 +28,6 @@ from stages.physics.terrain.surface import SHADOWED
 
 GRAZING = 0.02  # cos(incidence) below which a facet's brightness says little
 BROAD_PX = 4.0  # standard deviation: 7 in 10 of a wave of 32 px are broad, 3 of one of 16 px, none of 8 px
-LOCAL_PX = 8.0
-OUTLYING = 6.0  # standard deviations
 FREEDOM = 4.0  # of Student's distribution, as Lange et al. 1989 recommend
 
 
@@ -245,8 +243,9 @@ def _agree(seen: Sequence[Residual], shape: tuple[int, int]) -> Floats32:
     total, weight, square, spread = np.zeros((4, *shape), np.float32)
     parts = []
     for r in seen:
-        trust = np.divide(r.predicted.image**2, r.variance, out=np.zeros_like(r.variance), where=r.variance > 0)
-        trust *= (FREEDOM + 1) / (FREEDOM + r.relative**2 * trust)
+        trust = _trust(r) * np.divide(
+            r.predicted.image**2, r.variance, out=np.zeros_like(r.variance), where=r.variance > 0
+        )
         below, above = broadly(trust), broadly(trust * r.relative)
         r.broad = np.divide(above, below, out=np.zeros_like(above), where=below > 1e-3 * below.max(initial=0))
         total[r.box.part] += below * r.broad
@@ -265,13 +264,21 @@ def _agree(seen: Sequence[Residual], shape: tuple[int, int]) -> Floats32:
     return scatter * (1 + share) / np.maximum(1 - share, 0.1)
 
 
+def _trust(r: Residual) -> Floats32:
+    """(h, w) weights of Student's distribution, 0 where not usable."""
+    known = r.variance > 0
+    away = np.divide((r.relative * r.predicted.image) ** 2, r.variance, out=np.zeros_like(r.variance), where=known)
+    return np.where(known, (FREEDOM + 1) / (FREEDOM + away), 0).astype(np.float32)
+
+
 def _raise_variance(r: Residual) -> None:
-    """Take an image's variance up, in place, where it fits worse than elsewhere over some ten pixels: blocks out of place, other laws."""
-    known = (r.variance > 0).astype(np.float32)
-    energy = np.divide((r.relative * r.predicted.image) ** 2, r.variance, out=np.zeros_like(known), where=known > 0)
-    energy = np.minimum(energy, OUTLYING**2)
-    above, below = (cv2.GaussianBlur(v, (0, 0), LOCAL_PX, borderType=cv2.BORDER_CONSTANT) for v in (energy, known))
-    r.variance *= np.maximum(np.divide(above, below, out=np.ones_like(known), where=below > 1e-3), 1)
+    """Divide an image's variance, in place, by the mean weight around: blocks out of place, other laws, missing relief.
+
+    With weights pixel by pixel, broad differences would appear in the weighed residuals as fine waves, which count most.
+    """
+    known = r.variance > 0
+    here = np.divide(broadly(_trust(r)), broadly(known.astype(np.float32)), out=np.ones_like(r.variance), where=known)
+    r.variance /= here
 
 
 def broadly(values: Floats32) -> Floats32:
@@ -297,15 +304,13 @@ def _photograph(references: References, calibration: Calibration, k: int, box: B
 
 @numba.njit(cache=True)
 def _add(evidence, gradient, image, relative, east, north, variance):
-    """Add one image, weighed by Student's distribution, to the sums of its part of a window."""
+    """Add one image to the sums of its part of a window."""
     for r in range(image.shape[0]):
         for c in range(image.shape[1]):
             if not variance[r, c] > 0:
                 continue
             i = image[r, c]
-            residual = relative[r, c] * i
-            away = residual * residual / variance[r, c]
-            trust = (FREEDOM + 1) / (FREEDOM + away) / variance[r, c]
+            residual, trust = relative[r, c] * i, 1 / variance[r, c]
             p, q = i * east[r, c], i * north[r, c]
             evidence[0, r, c] += trust * i * i
             evidence[1, r, c] += trust * i * p

@@ -31,7 +31,7 @@ from stages.common.runner.stage import as_geotiff
 from stages.photographs.calibrate import read_calibration, write_calibration
 from stages.photographs.copying import copy_map, kept_attributes, sizes_of
 from stages.photographs.ground import Ground, open_ground
-from stages.physics.images.spectrum import WAVELENGTHS
+from stages.physics.images.spectrum import WAVELENGTHS, waves
 from stages.physics.maps.geotiff import write_geotiff
 from stages.physics.maps.grid import read_grid
 from stages.physics.maps.window import Box, Window
@@ -165,7 +165,8 @@ def work_block(ground: Ground, learned: Learned, block: Box, draws: int) -> list
     if not patch.photographs:
         return kept
     fields, posterior, evidence = fit(patch, patch.start(), learned.priors, learned.noise)
-    variance = variances(posterior, evidence, learned.priors, draws, np.random.default_rng([SEED, *block[:2]]))
+    rng = np.random.default_rng([SEED, *block[:2]])
+    variance = variances(learned.priors, (waves(posterior.draw(rng)) for _ in range(draws)), evidence.doubt)
     inner = Window(*block).within(box).part
     seen = evidence.products[0] > 0
     share = _share(seen)[inner]
