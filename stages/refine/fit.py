@@ -15,10 +15,13 @@ ROUNDS = 3
 
 
 def fit(
-    patch: Patch, fields: Floats32, priors: Priors, noise: Noise, only: Collection[int] | None = None
-) -> tuple[Floats32, Posterior, Evidence]:
-    """(2, H, W) posterior mean of heights and log albedo, from ``fields`` on. only : images that count, None for all"""
-    for number in range(ROUNDS):
+    patch: Patch, fields: Floats32, priors: Priors, noise: Noise, only: Collection[int] | None = None,
+) -> tuple[Floats32, Posterior, Evidence]:  # fmt: skip
+    """(2, H, W) posterior mean of heights and log albedo, from ``fields`` on. only : images that count, None for all
+
+    Heights without variance stay, and with them slopes and shadows: one round is enough.
+    """
+    for number in range(ROUNDS if priors.heights.variance.any() else 1):
         evidence = patch.evidence(fields, noise, only, relinearise=number == 1)
         posterior = Posterior(evidence.products, patch.px, priors)
         fields = posterior.mean(evidence.gradient, fields)
