@@ -1,8 +1,8 @@
 """How well `lunargr refine` finds relief that a DEM lacks: simulated scenes with known heights, each through the whole pipeline.
 
-    python tests/validation/refine.py --output results/refine [--case smooth] [--size 512]
+    python tests/validation/refine.py --output results/refine [--case smooth] [--images 8 --images 4] [--size 512]
 
-A third of twelve images is left out of the albedo and of the heights; the others make them. Every figure is written to
+A third of twelve images is left out of the albedo and of the heights; the others, or the first of them, make them. Every figure is written to
 docs/refine_figures.csv. Beside them stands photoclinometry as ASP's `sfs` states it (Alexandrov & Beyer 2018, Earth Space
 Sci. 5, 652): one law, one exposure per image, a smoothness prior, no albedo map; its weight is the best one for the true heights.
 """
@@ -30,6 +30,7 @@ CASES = {
     "reduced": "none",  # the DEM reduced 4 times
     "complete": "none",  # the DEM lacks nothing but 5 cm of white noise; all that the map lacks is albedo
 }
+USED = 8  # of twelve images
 BANDS = ((3, 8), (8, 16), (16, 64))  # px
 WEIGHTS = (1e-4, 1e-3, 1e-2, 1e-1)
 
@@ -38,24 +39,26 @@ def run(*words: object) -> None:
     subprocess.run([sys.executable, "-m", "lunargr_cli.main", *map(str, words), "--quiet"], check=True, cwd=ROOT)
 
 
-def make(folder: Path, case: str, size: int) -> None:
+def make(folder: Path, case: str, size: int, images: int) -> None:
     """The chain of commands up to the scores; what is there is not made again."""
-    f = {
-        n: folder / n for n in ("scene", "scene.h5", "crops.h5", "pairs.h5", "checkpoint.h5", "svbrdf.h5", "albedo.h5")
-    }
+    f = {n: folder / n for n in ("scene", "scene.h5", "crops.h5", "pairs.h5", "checkpoint.h5", "svbrdf.h5")}
+    albedo, refined = folder / f"albedo_{images}.h5", folder / f"refined_{images}.h5"
     if not f["scene"].exists():
         run("simulate", "-o", f["scene"], "--size-px", size, "--images", 12, "--hidden", CASES[case])
         if case == "reduced":
             reduce(f["scene"] / "dem.tif", 4)
+    with open(f["scene"] / "images.csv") as stream:
+        names = [row["image_id"] for k, row in enumerate(csv.DictReader(stream)) if k % 3][images:]
+    fewer = ("--leave-out", ",".join(names)) if names else ()
     steps = (
         ("scene.h5", "ingest", f["scene"] / "dem.tif", "--images", f["scene"] / "images.csv", "--gsd", 5),
         ("crops.h5", "sample", f["scene.h5"], "--count", 900, "--split", "50/10/40"),
         ("pairs.h5", "project", f["crops.h5"]),
         ("checkpoint.h5", "train", f["pairs.h5"], "--epochs", 4, "--batch", 8, "--precision", "fp32"),
         ("svbrdf.h5", "infer", f["scene.h5"], f["checkpoint.h5"], "--no-geotiff"),
-        ("albedo.h5", "albedo", f["svbrdf.h5"], f["scene.h5"], "--fold", "1/3", "--no-geotiff"),
-        ("refined.h5", "refine", f["albedo.h5"], f["scene.h5"], "--no-geotiff"),
-        ("held_out.h5", "held-out", f["pairs.h5"], folder / "refined.h5"),
+        (albedo.name, "albedo", f["svbrdf.h5"], f["scene.h5"], "--fold", "1/3", *fewer, "--no-geotiff"),
+        (refined.name, "refine", albedo, f["scene.h5"], "--no-geotiff"),
+        (f"held_out_{images}.h5", "held-out", f["pairs.h5"], refined),
     )
     for name, *words in steps:
         if not (folder / name).exists():
@@ -81,11 +84,11 @@ def in_band(values: np.ndarray, known: np.ndarray, band: tuple[float, float]) ->
     return float(np.sqrt(power[(f <= 1 / band[0]) & (f > 1 / band[1])].sum() / (window**2).sum() / values.size))
 
 
-def score(folder: Path, case: str) -> dict[str, object]:
+def score(folder: Path, case: str, used: int) -> dict[str, object]:
     """One row of figures."""
     with h5py.File(folder / "scene/truth.h5") as file:
         truth, level = file["elevation"][...], np.log(file["standard_iof"][...])
-    with h5py.File(folder / "refined.h5") as file:
+    with h5py.File(folder / f"refined_{used}.h5") as file:
         h, std, albedo, albedo_std, alone, elevation = (
             file[n][...] for n in ("elevation_correction", "elevation_std", "albedo", "albedo_std", "albedo_alone", "elevation")
         )  # fmt: skip
@@ -99,7 +102,7 @@ def score(folder: Path, case: str) -> dict[str, object]:
     dem = elevation - h
     known = np.isfinite(dem) & np.isfinite(truth) & np.isfinite(albedo)
     seen = known & (images > 1)
-    row: dict[str, object] = {"case": case, "reason": reason}
+    row: dict[str, object] = {"case": case, "images": used, "reason": reason}
     row |= {f"gain_{n}": round(float(v), 1) for n, v in zip(("percent", "low", "high"), gain, strict=True)}
     for low, high in BANDS:
         before, after = (in_band(np.where(known, truth - v, 0), known, (low, high)) for v in (dem, elevation))
@@ -115,7 +118,7 @@ def score(folder: Path, case: str) -> dict[str, object]:
     row |= {"coverage_95_albedo": share(z < 1.96), "coverage_68_albedo": share(z < 1.0)}
     row["albedo_error"] = round(float(np.nanstd(away)), 4)
     row["albedo_error_alone"] = round(float(np.std((np.log(alone) - ratio)[seen])), 4)
-    with open(folder / "held_out.json") as stream:
+    with open(folder / f"held_out_{used}.json") as stream:
         result = json.load(stream)
     mse = {n: result["models"][n]["mse"] for n in ("terrain", "albedo", "refined")}
     row |= {f"mse_{n}": f"{v:.4g}" for n, v in mse.items()}
@@ -148,7 +151,7 @@ def photoclinometry(folder: Path) -> dict[str, object]:
         angles = [
             np.radians(file[n][...]) for n in ("incidence_deg", "sun_azimuth_deg", "emission_deg", "camera_azimuth_deg")
         ]
-    with h5py.File(folder / "refined.h5") as file:
+    with h5py.File(folder / f"refined_{USED}.h5") as file:
         dem = file["elevation"][...] - file["elevation_correction"][...]
     known = np.isfinite(dem) & np.isfinite(truth)
     ground = np.where(known, dem, dem[known].mean()).astype(float)
@@ -231,6 +234,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--output", type=Path, default=ROOT / "results/refine")
     parser.add_argument("--case", choices=list(CASES), action="append")
+    parser.add_argument("--images", type=int, choices=range(1, USED + 1), action="append", help="that make the heights")
     parser.add_argument("--size", type=int, default=512)
     parser.add_argument("--docs", type=Path, help="CSV to write the rows into")
     options = parser.parse_args()
@@ -238,9 +242,11 @@ def main() -> None:
     for case in options.case or CASES:
         folder = (options.output / case).resolve()
         folder.mkdir(parents=True, exist_ok=True)
-        make(folder, case, options.size)
-        rows.append(score(folder, case) | (photoclinometry(folder) if case != "complete" else {}))
-        print(json.dumps(rows[-1], indent=1), flush=True)
+        for images in options.images or [USED]:
+            make(folder, case, options.size, images)
+            beside = photoclinometry(folder) if case != "complete" and images == USED else {}
+            rows.append(score(folder, case, images) | beside)
+            print(json.dumps(rows[-1], indent=1), flush=True)
     if options.docs:
         columns = list(dict.fromkeys(name for row in rows for name in row))
         with open(options.docs, "w", newline="") as stream:
