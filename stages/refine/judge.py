@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stages.common.arrays import Floats32
 from stages.common.intervals import gain_interval
@@ -35,10 +36,8 @@ MARGIN_PX = 16  # around windows: read, and not judged
 FOLDS = 4
 ENOUGH = 8  # windows; where there are fewer, their quarters are the units of ground
 THINNED = 5
-SLOPE, FLAT_PX = (
-    0.05,
-    8.0,
-)  # where the search for spectra starts: slope of a wave, constant heights from this wavelength on
+SLOPE = 0.05  # of a wave, where the search for spectra starts
+FLAT_PX = 8.0  # and from this wavelength on heights of one variance
 
 
 @dataclass(frozen=True)
@@ -188,47 +187,40 @@ def _score(
     without = [[patch.predict(p, fields).image for fields in (held, alone)] for p in tested]
     fields, posterior, evidence = fit(patch, start, priors, noise, used)
     rng = np.random.default_rng([SEED, *window[:2], min(left)])
-    found = (waves(x) for x in (fields, posterior.draw(rng), posterior.draw(rng, prior=False)))
-    turn = Turn(*found, evidence.doubt, [])
-    judged, others = Window(*window).within(patch.box), np.zeros(patch.shape, np.uint8)
-    for photograph in patch.photographs:
-        if photograph.k in used:
-            others[photograph.box.within(patch.box).part] += np.isfinite(photograph.measured)
-    at = np.arange(others.size).reshape(others.shape)
-    for photograph, before in zip(tested, without, strict=True):
-        predicted, box = patch.predict(photograph, fields), photograph.box.within(patch.box)
-        known = np.zeros(box[2:], bool)
-        known[max(0, judged.row - box.row) : max(0, judged.row + judged.height - box.row),
-              max(0, judged.col - box.col) : max(0, judged.col + judged.width - box.col)] = True  # fmt: skip
-        known &= np.isfinite(photograph.measured) & np.isfinite([predicted.image, *before]).all(axis=0)
-        known &= others[box.part] > 1  # one image tells neither heights nor albedo
+    kept = (waves(x) for x in (fields, posterior.draw(rng), posterior.draw(rng, prior=False)))
+    turn = Turn(*kept, evidence.doubt, [])
+    quarter, others = _quarters(patch, window), np.zeros(patch.shape, np.uint8)
+    for p in patch.photographs:
+        if p.k in used:
+            others[p.box.within(patch.box).part] += np.isfinite(p.measured)
+    for p, before in zip(tested, without, strict=True):
+        after, values = patch.predict(p, fields), np.full((6, *patch.shape), np.nan, np.float32)
         # as one who has not seen it takes it: a calibrated image has no gain of its own
-        measured = photograph.measured * np.float32(calibration.gain[photograph.k] if ground.units == "iof" else 1)
-        errors = [np.where(known, (v - measured) ** 2, 0) for v in (predicted.image, *before)]
-        for part, corner in _quarters(box, judged):
-            if known[part].any():
-                for sums, e in zip((scores.refined, scores.held, scores.albedo), errors, strict=True):
-                    sums.append(float(e[part].sum(dtype=float)))
-                scores.unit.append((*window[:2], *corner))
-        place = np.clip(np.digitize(predicted.cosine, COSINES) - 1, 0, len(COSINES) - 2)
-        place = np.where(predicted.shadow > SHADOWED, len(COSINES) - 1, place)
-        pixels = (v[known][::THINNED] for v in (at[box.part], np.sqrt(errors[0]), predicted.image, place))
-        turn.judged.append(
-            Judged(photograph.k, *pixels, max(photograph.sun_sine(ground.references.surface.grid), 1e-3))
-        )
+        measured = p.measured * np.float32(calibration.gain[p.k] if ground.units == "iof" else 1)
+        values[:, *p.box.within(patch.box).part] = measured, after.image, *before, after.cosine, after.shadow
+        # one image tells neither heights nor albedo
+        known = np.isfinite(values).all(axis=0) & (quarter >= 0) & (others > 1)
+        errors = (values[1:4] - values[0]) ** 2
+        for k in np.unique(quarter[known]):
+            here = errors[:, known & (quarter == k)].sum(axis=1, dtype=float)
+            for sums, value in zip((scores.refined, scores.held, scores.albedo), here, strict=True):
+                sums.append(float(value))
+            scores.unit.append((*window[:2], int(k)))
+        place = np.clip(np.digitize(values[4], COSINES) - 1, 0, len(COSINES) - 2)
+        place[values[5] > SHADOWED] = len(COSINES) - 1
+        at = np.flatnonzero(known)[::THINNED]
+        pixels = (v.ravel()[at] for v in (np.sqrt(errors[0]), values[1], place))
+        turn.judged.append(Judged(p.k, at, *pixels, max(p.sun_sine(ground.references.surface.grid), 1e-3)))
     patch.refresh(None)
     return [turn]
 
 
-def _quarters(box: Window, judged: Window) -> list[tuple[tuple[slice, slice], tuple[int, int]]]:
-    """The parts of an image's window in the quarters of the judged one, and which quarter each is."""
-    found = []
-    for down in (0, 1):
-        for right in (0, 1):
-            row, col = judged.row + down * WINDOW_PX // 2, judged.col + right * WINDOW_PX // 2
-            rows = slice(max(0, row - box.row), max(0, row + WINDOW_PX // 2 - box.row))
-            cols = slice(max(0, col - box.col), max(0, col + WINDOW_PX // 2 - box.col))
-            found.append(((rows, cols), (down, right)))
+def _quarters(patch: Patch, window: Box) -> NDArray[np.int8]:
+    """(H, W) the quarter of the judged window, 0 to 3, that a pixel lies in, -1 around it."""
+    found = np.full(patch.shape, -1, np.int8)
+    judged = Window(*window).within(patch.box)
+    rows, cols = np.indices((judged.height, judged.width))
+    found[judged.part] = 2 * (rows >= WINDOW_PX // 2) + (cols >= WINDOW_PX // 2)
     return found
 
 

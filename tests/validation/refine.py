@@ -1,8 +1,9 @@
 """How well `lunargr refine` finds relief that a DEM lacks: simulated scenes with known heights, each through the whole pipeline.
 
-    python tests/validation/refine.py --output results/refine [--case smooth] [--images 8 --images 4] [--size 512]
+    python tests/validation/refine.py --output results/refine [--case smooth --case smooth:4] [--size 512]
 
-A third of twelve images is left out of the albedo and of the heights; the others, or the first of them, make them. Every figure is written to
+A third of twelve images is left out of the albedo and of the heights; the other eight, or as many of them as
+a case names, make them. Every figure is written to
 docs/refine_figures.csv. Beside them stands photoclinometry as ASP's `sfs` states it (Alexandrov & Beyer 2018, Earth Space
 Sci. 5, 652): one law, one exposure per image, a smoothness prior, no albedo map; its weight is the best one for the true heights.
 """
@@ -31,6 +32,7 @@ CASES = {
     "complete": "none",  # the DEM lacks nothing but 5 cm of white noise; all that the map lacks is albedo
 }
 USED = 8  # of twelve images
+ROWS = (*CASES, "smooth:4", "smooth:2", "smooth:1")
 BANDS = ((3, 8), (8, 16), (16, 64))  # px
 WEIGHTS = (1e-4, 1e-3, 1e-2, 1e-1)
 
@@ -233,20 +235,20 @@ def back(terms: list, values: list[np.ndarray], gsd: float) -> np.ndarray:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--output", type=Path, default=ROOT / "results/refine")
-    parser.add_argument("--case", choices=list(CASES), action="append")
-    parser.add_argument("--images", type=int, choices=range(1, USED + 1), action="append", help="that make the heights")
+    parser.add_argument("--case", choices=ROWS, action="append", help="and the number of images that make the heights")
     parser.add_argument("--size", type=int, default=512)
     parser.add_argument("--docs", type=Path, help="CSV to write the rows into")
     options = parser.parse_args()
     rows = []
-    for case in options.case or CASES:
+    for row in options.case or ROWS:
+        case, _, number = row.partition(":")
+        images = int(number or USED)
         folder = (options.output / case).resolve()
         folder.mkdir(parents=True, exist_ok=True)
-        for images in options.images or [USED]:
-            make(folder, case, options.size, images)
-            beside = photoclinometry(folder) if case != "complete" and images == USED else {}
-            rows.append(score(folder, case, images) | beside)
-            print(json.dumps(rows[-1], indent=1), flush=True)
+        make(folder, case, options.size, images)
+        beside = photoclinometry(folder) if case != "complete" and images == USED else {}
+        rows.append(score(folder, case, images) | beside)
+        print(json.dumps(rows[-1], indent=1), flush=True)
     if options.docs:
         columns = list(dict.fromkeys(name for row in rows for name in row))
         with open(options.docs, "w", newline="") as stream:
