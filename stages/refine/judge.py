@@ -149,14 +149,14 @@ def find_out(ground: Ground, form: str | None, progress: Progress = show_nothing
     folds = min(FOLDS, count)
     for number, (patch, window) in enumerate(zip(patches, windows, strict=True)):
         mine = []
-        for fold in range(folds if count > 1 else 0):
+        for fold in range(folds):
             progress(number * folds + fold, len(windows) * folds, "images left out")
             left = {k for k in range(count) if k % folds == fold}
             mine += _score(scores, ground, calibration, patch, window, (priors, noise), left)
         widening.add(mine)
         turns += mine
     priors = replace(priors, widening=widening.spectrum())
-    gain, reason = _decide(scores, len(windows), count)
+    gain, reason = _decide(scores, len(windows))
     return Learned(_with_intervals(calibration, priors, turns), priors, noise, gain, reason)
 
 
@@ -232,12 +232,10 @@ def _shared_albedo(ground: Ground, calibration: Calibration, patch: Patch, used:
     return estimate(ratio, confidence, spread, terrain_variance(ground.surface, patch.box))[0]
 
 
-def _decide(scores: Scores, windows: int, count: int) -> tuple[tuple[float, float, float], str]:
+def _decide(scores: Scores, windows: int) -> tuple[tuple[float, float, float], str]:
     """The gain with its interval, and why the heights stay, empty where they do not."""
-    if count < 2:
-        return (math.nan,) * 3, "one image: none is left to judge by"
-    if not scores.unit:
-        return (math.nan,) * 3, "no two images show the same ground"
+    if not scores.unit:  # one is left out, and one alone tells neither heights nor albedo
+        return (math.nan,) * 3, "no three images show the same ground"
     corners = np.array(scores.unit)
     names = corners[:, :2] if windows >= ENOUGH else corners
     unit = np.unique(names, axis=0, return_inverse=True)[1].ravel()

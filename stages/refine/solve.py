@@ -78,14 +78,15 @@ class Posterior:
     def mean(self, gradient: Floats32, around: Floats32) -> Floats32:
         """(2, H, W) heights and log albedo. gradient : (3, H, W) sums of w j times the residual at ``around`` (2, H, W)"""
         seen = _reduced(self._root, gradient) + self.seen(around)
-        return self._fields(self._solve(self._back(self._trust * waves(seen))))
+        near = np.divide(waves(around), self._scale, out=np.zeros_like(self._scale), where=self._scale > 0)
+        return self._fields(self._solve(self._back(self._trust * waves(seen)), near))
 
     def draw(self, rng: np.random.Generator, prior: bool = True) -> Floats32:
         """(2, H, W) by which one draw of the posterior differs from its mean. prior : False for what noise alone does to the mean"""
         right = self._back(rng.standard_normal((3, *self.shape), np.float32))
         if prior:
             right += rng.standard_normal((FIELDS, *self.shape), np.float32)
-        return self._fields(self._solve(right))
+        return self._fields(self._solve(right, np.zeros_like(right)))
 
     def misfit(self, gradient: Floats32, around: Floats32, found: Floats32) -> Floats32:
         """(3, H, W) of what the images say and ``found`` (2, H, W) does not; arguments as for :meth:`mean`"""
@@ -109,14 +110,16 @@ class Posterior:
         values[0] *= self._fine
         return values
 
-    def _solve(self, right: Floats32) -> Floats32:
-        """z of (1 + B'B) z = right."""
-        z, residual = np.zeros_like(right), right.copy()
+    def _solve(self, right: Floats32, near: Floats32) -> Floats32:
+        """z of (1 + B'B) z = right. near : where to start"""
+        z, residual = near.copy(), right.copy()
+        if near.any():
+            residual -= near + self._back(self._forth(near))
         ahead = residual / self._diagonal
         step = ahead.copy()
-        size = first = _dot(residual, ahead)
+        size, whole = _dot(residual, ahead), _dot(right, right / self._diagonal)
         for _ in range(ITERATIONS):
-            if not size > TOLERANCE**2 * first:
+            if not size > TOLERANCE**2 * whole:
                 break
             image = step + self._back(self._forth(step))
             length = np.float32(size / _dot(step, image))

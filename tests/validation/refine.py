@@ -32,7 +32,7 @@ CASES = {
     "complete": "none",  # the DEM lacks nothing but 5 cm of white noise; all that the map lacks is albedo
 }
 USED = 8  # of twelve images
-ROWS = (*CASES, "smooth:4", "smooth:2", "smooth:1")
+ROWS = (*CASES, "smooth:4")
 BANDS = ((3, 8), (8, 16), (16, 64))  # px
 WEIGHTS = (1e-4, 1e-3, 1e-2, 1e-1)
 
