@@ -24,7 +24,7 @@ def fit(
     for number in range(ROUNDS if priors.heights.variance.any() else 1):
         evidence = patch.evidence(fields, noise, only, relinearise=number == 1)
         posterior = Posterior(evidence.products, patch.px, priors)
-        fields = posterior.mean(evidence.gradient, fields)
+        fields = posterior.mean(evidence.gradient, fields, number > 0)
         if number == 0:
             patch.refresh(fields[0])
     return fields, posterior, evidence

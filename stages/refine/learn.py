@@ -74,7 +74,7 @@ def learn(
                 patch.refresh(fields[k][0])
             evidence = patch.evidence(fields[k], noise, relinearise=number in REFRESHED)
             posterior = Posterior(evidence.products, patch.px, priors)
-            found = posterior.mean(evidence.gradient, fields[k])
+            found = posterior.mean(evidence.gradient, fields[k], number > 0)
             sums.add(posterior, evidence.gradient, fields[k], found, posterior.draw(rng))
             fields[k] = found
             seen.add(evidence.residuals)

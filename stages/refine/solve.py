@@ -75,11 +75,16 @@ class Posterior:
             [slopes * self._fine**2, np.broadcast_to(mean[0], self.shape)]
         )
 
-    def mean(self, gradient: Floats32, around: Floats32) -> Floats32:
-        """(2, H, W) heights and log albedo. gradient : (3, H, W) sums of w j times the residual at ``around`` (2, H, W)"""
+    def mean(self, gradient: Floats32, around: Floats32, near: bool) -> Floats32:
+        """(2, H, W) heights and log albedo. gradient : (3, H, W) sums of w j times the residual at ``around`` (2, H, W)
+
+        near : whether ``around`` is a mean of such a posterior itself, to start from
+        """
         seen = _reduced(self._root, gradient) + self.seen(around)
-        near = np.divide(waves(around), self._scale, out=np.zeros_like(self._scale), where=self._scale > 0)
-        return self._fields(self._solve(self._back(self._trust * waves(seen)), near))
+        start = np.zeros_like(self._scale)
+        if near:
+            np.divide(waves(around), self._scale, out=start, where=self._scale > 0)
+        return self._fields(self._solve(self._back(self._trust * waves(seen)), start))
 
     def draw(self, rng: np.random.Generator, prior: bool = True) -> Floats32:
         """(2, H, W) by which one draw of the posterior differs from its mean. prior : False for what noise alone does to the mean"""
@@ -110,11 +115,11 @@ class Posterior:
         values[0] *= self._fine
         return values
 
-    def _solve(self, right: Floats32, near: Floats32) -> Floats32:
-        """z of (1 + B'B) z = right. near : where to start"""
-        z, residual = near.copy(), right.copy()
-        if near.any():
-            residual -= near + self._back(self._forth(near))
+    def _solve(self, right: Floats32, start: Floats32) -> Floats32:
+        """z of (1 + B'B) z = right."""
+        z, residual = start.copy(), right.copy()
+        if start.any():
+            residual -= start + self._back(self._forth(start))
         ahead = residual / self._diagonal
         step = ahead.copy()
         size, whole = _dot(residual, ahead), _dot(right, right / self._diagonal)
