@@ -110,8 +110,9 @@ def score(folder: Path, case: str, used: int) -> dict[str, object]:
         before, after = (in_band(np.where(known, truth - v, 0), known, (low, high)) for v in (dem, elevation))
         row |= {f"before_m_{low}_{high}px": round(before, 4), f"after_m_{low}_{high}px": round(after, 4)}
         row[f"height_error_percent_{low}_{high}px"] = round(100 * (after / before - 1), 1)
-    z = np.abs(truth - elevation)[seen] / std[seen]
-    row |= {"coverage_95_height": share(z < 1.96), "coverage_68_height": share(z < 1.0)}
+    if not reason:
+        z = np.abs(truth - elevation)[seen] / std[seen]
+        row |= {"coverage_95_height": share(z < 1.96), "coverage_68_height": share(z < 1.0)}
     # the truth's brightness at incidence 30, emission 0, phase 30 over the map's
     ratio = level - np.log(standard_iof(model, dict(zip(names, coefficients, strict=True))))
     away = np.where(seen, np.log(albedo) - ratio, np.nan)
