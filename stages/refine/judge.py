@@ -187,8 +187,8 @@ def _score(
     without = [[patch.predict(p, fields).image for fields in (held, alone)] for p in tested]
     fields, posterior, evidence = fit(patch, start, priors, noise, used)
     rng = np.random.default_rng([SEED, *window[:2], min(left)])
-    kept = (waves(x) for x in (fields, posterior.draw(rng), posterior.draw(rng, prior=False)))
-    turn = Turn(*kept, evidence.doubt, [])
+    mean, draw, noise_alone = (waves(x) for x in (fields, posterior.draw(rng), posterior.draw(rng, prior=False)))
+    turn = Turn(mean, draw, noise_alone, evidence.doubt, [])
     quarter, others = _quarters(patch, window), np.zeros(patch.shape, np.uint8)
     for p in patch.photographs:
         if p.k in used:
@@ -209,8 +209,9 @@ def _score(
         place = np.clip(np.digitize(values[4], COSINES) - 1, 0, len(COSINES) - 2)
         place[values[5] > SHADOWED] = len(COSINES) - 1
         at = np.flatnonzero(known)[::THINNED]
-        pixels = (v.ravel()[at] for v in (np.sqrt(errors[0]), values[1], place))
-        turn.judged.append(Judged(p.k, at, *pixels, max(p.sun_sine(ground.references.surface.grid), 1e-3)))
+        residual, image, bins = (v.ravel()[at] for v in (np.sqrt(errors[0]), values[1], place))
+        least = max(p.sun_sine(ground.references.surface.grid), 1e-3)
+        turn.judged.append(Judged(p.k, at, residual, image, bins, least))
     patch.refresh(None)
     return [turn]
 
