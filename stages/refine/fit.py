@@ -19,7 +19,7 @@ def fit(
 ) -> tuple[Floats32, Posterior, Evidence]:  # fmt: skip
     """(2, H, W) posterior mean of heights and log albedo, from ``fields`` on. only : images that count, None for all
 
-    Heights without variance stay, and with them slopes and shadows: one round is enough.
+    Heights without variance stay, and with them slopes and shadows: one round, with the weights of its start.
     """
     for number in range(ROUNDS if priors.heights.variance.any() else 1):
         evidence = patch.evidence(fields, noise, only, relinearise=number == 1)

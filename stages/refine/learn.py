@@ -26,7 +26,7 @@ SEED = 69
 LEAST_SHARE = 0.02  # of a wave's variance that images determine
 LONGEST_PX = 16.0  # broader relief is the DEM's: of its error nothing is learned there
 TOLD = 0.3  # from where on the found power tells a variance by itself
-TRUST = (0.05, 2.0)  # F: beyond it, what an image misses at some wavelengths spoils the others
+TRUST = (0.05, 2.0)  # F, set on the Apollo film frames and the case 'smooth' of tests/validation/refine.py
 DARK = 0.2  # of the median brightness: below it errors no longer fall with the brightness
 BINS = 8  # of brightness, for the noise
 
