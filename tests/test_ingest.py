@@ -12,7 +12,7 @@ import small_scene
 from rasterio.transform import Affine
 
 from schemas import ConfigError, GeometryError, InputError
-from stages import ingest
+from stages import ingest, sample
 from stages.ingest import elevation
 from stages.physics.maps import rasters
 from stages.physics.maps.positions import valid_positions
@@ -230,9 +230,13 @@ def test_image_elsewhere_is_refused_or_skipped(small_files, tmp_path):
         ingest.run(small_files.dem, table, tmp_path / "scene.h5", ingest.Config(crop=32, skip_outside=True))
 
 
-def test_crop_larger_than_any_valid_region(small_files, tmp_path):
-    with pytest.raises(GeometryError, match="larger than any valid region"):
-        ingest.run(small_files.dem, small_files.images, tmp_path / "scene.h5", ingest.Config(crop=384))
+def test_images_without_valid_ground_are_refused(small_files, tmp_path):
+    with rasterio.open(small_files.folder / "image0.tif") as image:
+        blank = np.full_like(image.read(1), -1e4)
+        small_scene.write_raster(tmp_path / "blank.tif", blank, image.crs, image.transform, nodata=-1e4)
+    table = edit_table(small_files, tmp_path, path="blank.tif")
+    with pytest.raises(GeometryError, match="expected valid ground under some image, found none"):
+        ingest.run(small_files.dem, table, tmp_path / "scene.h5", ingest.Config(crop=32))
     with pytest.raises(ConfigError, match="even"):
         ingest.run(small_files.dem, small_files.images, tmp_path / "scene.h5", ingest.Config(crop=33))
 
@@ -245,8 +249,9 @@ def test_a_dem_too_coarse_for_an_image_is_told_how_fine_it_must_be(small_files, 
         values[:, : middle - 10] = values[:, middle + 10 :] = -1e4  # 20 pixels of 12 m
         small_scene.write_raster(tmp_path / "strip.tif", values, image.crs, t, nodata=-1e4)
     table = edit_table(small_files, tmp_path, path="strip.tif")
+    ingest.run(small_files.dem, table, tmp_path / "scene.h5", ingest.Config(crop=32))
     with pytest.raises(GeometryError, match=r"larger than any valid region of any image, where (\d+) m") as caught:
-        ingest.run(small_files.dem, table, tmp_path / "scene.h5", ingest.Config(crop=32))
+        sample.run(tmp_path / "scene.h5", tmp_path / "crops.h5", sample.Config(tile_m=1000))
     assert "choose a `crop`" not in str(caught.value)
     assert 5 < float(re.search(r"a grid of (\S+) m or finer", str(caught.value))[1]) <= 7.5
 

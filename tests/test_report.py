@@ -41,7 +41,6 @@ def _write_maps(folder, rng):
         out.write("elevation", np.where(valid, elevation, np.nan))
         out.write("dem_valid", valid)
         out.write("valid", np.stack([valid, valid & (np.arange(140) < 70)]))
-        out.write("valid_position", np.stack([valid, valid]))
         out.write("frame_window", np.tile([0, 0, 90, 140], (2, 1)))
         out.write("valid_area_m2", [1e6, 2e6])
         out.write("image_id", ["first", "<second>"])

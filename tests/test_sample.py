@@ -12,6 +12,7 @@ from geographiclib.geodesic import Geodesic
 from schemas import ConfigError, GeometryError
 from stages import sample
 from stages.physics.maps.ground_tiles import Tiles
+from stages.physics.maps.positions import valid_positions
 
 
 def crops(small_artefacts, tmp_path, **options):
@@ -78,7 +79,9 @@ def test_shares_of_the_split_and_of_the_images(small_artefacts, tmp_path):
 def test_stack_crops_every_image_that_covers_a_place(small_artefacts, tmp_path):
     _, data = crops(small_artefacts, tmp_path, stack=True, count=40)
     with h5py.File(small_artefacts["scene"]) as scene:
-        positions = scene["valid_position"][...].astype(bool)
+        size, height, width = int(scene.attrs["crop_px"]), *scene["elevation"].shape
+        valid = scene["valid"][...]
+        positions = np.stack([valid_positions(v, height, width, (0, 0, height, width), size) for v in valid])
     for site in np.unique(data["site"]):
         mine = data["site"] == site
         r, c = data["row"][mine][0], data["col"][mine][0]
@@ -155,7 +158,7 @@ def test_impossible_requests_are_refused(small_artefacts, tmp_path):
         ({"count": 0}, ConfigError, "`count`: expected 1"),
         ({"crop": 0}, ConfigError, "multiple of 16"),
         ({"tile_m": float("nan")}, ConfigError, "`tile_m`"),
-        ({"crop": 320, "tile_m": 6400.0}, GeometryError, "no crop"),
+        ({"crop": 320, "tile_m": 6400.0}, GeometryError, "larger than any valid region"),
     ]:
         with pytest.raises(kind, match=words):
             sample.run(scene, out, sample.Config(**options))

@@ -30,7 +30,7 @@ def command(
     ] = None,
     crop: Annotated[
         int,
-        typer.Option("--crop", min=1, max=options.MOST, help="Crop size in pixels for which valid centres are found."),
+        typer.Option("--crop", min=1, max=options.MOST, help="Crop size in pixels, for the split's ground tiles."),
     ] = Config.crop,
     output: options.OutputFile = Path("scene.h5"),
     body: options.BodyOption = Config.body,
@@ -48,7 +48,7 @@ def command(
     overwrite: options.Overwrite = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Put a DEM on a metric grid and find valid crop centres for each image."""
+    """Put a DEM on a metric grid and find the valid ground of each image."""
     config = options.configure(Config, locals(), shard=options.parse_shard(shard))
     console, to = Console(quiet), options.make_output(locals())
     summary = ingest.run(dem, images, to, config, console.say, console.progress)
@@ -67,4 +67,4 @@ def command(
         )
     if summary.frames:
         rows = [(f.image_id, f.units, f"{a:.2f}") for f, a in zip(summary.frames, summary.valid_area_km2, strict=True)]
-        console.table(f"images: where a crop of {crop} px fits", ("image", "units", "km2"), rows)
+        console.table("images: valid ground", ("image", "units", "km2"), rows)

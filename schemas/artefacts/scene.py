@@ -21,7 +21,7 @@ SCENE = declare(
         name="scene",
         version=1,
         stage="ingest",
-        title="A DEM on a metric grid, its images and where crops may be centred",
+        title="A DEM on a metric grid, its images and the valid ground that they show",
         dims={
             "frame": "source images",
             "y": "grid rows, north to south",
@@ -41,15 +41,6 @@ SCENE = declare(
                 compress=True,
                 stacked_along="frame",
             ),
-            grid_map(
-                "valid_position",
-                "u1",
-                "1",
-                "1 = a crop centred here lies wholly in valid data",
-                flags=VALIDITY,
-                compress=True,
-                stacked_along="frame",
-            ),
             Variable(
                 "frame_window",
                 ("frame", "window"),
@@ -58,12 +49,12 @@ SCENE = declare(
                 "row, column, height, width of the box that holds the image's valid pixels",
                 minimum=0,
             ),
-            column("frame", "valid_area_m2", "m2", "ground covered by valid positions", minimum=0.0, finite=True),
+            column("frame", "valid_area_m2", "m2", "valid ground that the image shows", minimum=0.0, finite=True),
         )
         + FRAME_TABLE,
         attributes=PLACE
         + (
-            Attribute("crop_px", "crop size that valid_position was eroded for", True, "integer", 2, LARGEST_COUNT),
+            Attribute("crop_px", "crop size, for the split's ground tiles", True, "integer", 2, LARGEST_COUNT),
             Attribute("elevation_source", "the DEM file, relative to this file"),
             Attribute("elevation_low_m", "least elevation, m", False, "number", *HEIGHTS),
             Attribute("elevation_high_m", "largest elevation, m", False, "number", *HEIGHTS),

@@ -1,4 +1,4 @@
-"""ingest: a DEM on a metric grid at the working GSD, and where crops of each image may be centred.
+"""ingest: a DEM on a metric grid at the working GSD, and the valid ground that each image shows.
 
 Everything streams in blocks: memory does not grow with the DEM.
 """
@@ -13,7 +13,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import cv2
 import h5py
 import numpy as np
 
@@ -76,8 +75,6 @@ def work(dem: Path, images: Path | None, output: Output, config: Config, say: Sa
             say(f"warning: {sentence}")
     alone = config.shard[1] == 1
     with _open_terrain(dem, images, config, body, progress, say) as terrain:
-        if frames and config.crop > min(terrain.grid.height, terrain.grid.width):
-            raise _no_positions(dem, config, terrain.grid.gsd, min(terrain.grid.height, terrain.grid.width), "the DEM")
         mine, skipped = check_frames(
             frames[slice(*shard_range(len(frames), config.shard))], terrain.grid, config.skip_outside, say
         )
@@ -103,7 +100,7 @@ def work(dem: Path, images: Path | None, output: Output, config: Config, say: Sa
             writer.file.attrs["dem_valid_px"] = known
             if known:  # a shard may lie wholly on nodata
                 writer.file.attrs["elevation_low_m"], writer.file.attrs["elevation_high_m"] = low, high
-            for name in ("valid", "valid_position", "frame_window"):  # also where there is no image at all
+            for name in ("valid", "frame_window"):  # also where there is no image at all
                 writer.dataset(name)
             elevation = terrain.file or writer.file
             areas = [
@@ -113,9 +110,8 @@ def work(dem: Path, images: Path | None, output: Output, config: Config, say: Sa
                 for k, f in enumerate(mine)
             ]
             progress(len(mine), len(mine), "image masks")
-            if frames and alone and not any(areas):
-                side = _largest_square(writer.file, config.crop)
-                raise _no_positions(images, config, terrain.grid.gsd, side, "any valid region of any image")
+            if frames and alone:
+                _check_shown(images, areas)
             writer.write("valid_area_m2", np.array(areas))
             hashed = [hash_files(frame) for frame in mine]
             check_distinct(hashed)
@@ -137,7 +133,11 @@ def in_parts(job: Job, dem: Path, images: Path | None, config: Config) -> Summar
         merge.run(pieces, Output(grid, overwrite=True), merge.Config(virtual=True, inputs=(dem,)))
     names = [frame.image_id for frame in read_frames(images, find_body(config.body))] if images else []
     pieces = job.shards("images", [grid, images], replace(config, gsd=None), len(names))
-    _check_positions(pieces, images, config)
+    areas = []
+    for piece in pieces:
+        with open_artefact(piece, SCENE) as file:
+            areas += file["valid_area_m2"][...].tolist()
+    _check_shown(images, areas)
     merge.run(pieces, output, made_of, progress=job.progress)
     found = summarise(output.file)
     kept = {frame.image_id for frame in found.frames}
@@ -234,36 +234,13 @@ def _count_bands(dem: Path, config: Config) -> int:
     return math.ceil(plan.grid.height / config.block)
 
 
-def _check_positions(parts: Sequence[Path], images: Path | None, config: Config) -> None:
-    """Refuse shards of a scene in which no crop fits anywhere, as one run does at its end. Raises GeometryError."""
-    gsd, side = math.nan, 0
-    for part in parts:
-        with open_artefact(part, SCENE) as file:
-            if file["valid_area_m2"][...].any():
-                return
-            gsd, side = float(file.attrs["gsd_m"]), max(side, _largest_square(file, config.crop))
-    raise _no_positions(images, config, gsd, side, "any valid region of any image")
-
-
-def _largest_square(file: h5py.File, crop: int) -> int:
-    """px, side of the largest square of valid ground that an image shows, where that is smaller than a crop."""
-    largest = 0
-    for k, (row, col, height, width) in enumerate(file["frame_window"][...].tolist()):
-        for top in range(row, row + height, 4 * crop):
-            strip = file["valid"][k, top : min(top + 5 * crop, row + height), col : col + width]
-            reach = cv2.distanceTransform(np.pad(strip, 1), cv2.DIST_C, 3).max(initial=0)
-            largest = max(largest, 2 * int(reach) - 1)
-    return largest
-
-
-def _no_positions(where: Path | None, config: Config, gsd: float, side: int, what: str) -> GeometryError:
-    """No crop fits. side : px, of the largest square that would"""
-    smaller = f"choose a `crop` of at most {side // 2 * 2} px, or " if side >= SMALLEST_CROP else ""
-    return GeometryError(
-        f"{where}: a crop of {config.crop} px ({config.crop * gsd:g} m) is larger than {what}, where {max(side, 0) * gsd:g} m "
-        f"({max(side, 0)} px) fit; {smaller}take a grid of {max(side, 1) * gsd / config.crop:.3g} m or finer (`gsd`), from a DEM "
-        "that is as fine."
-    )
+def _check_shown(images: Path | None, areas: Sequence[float]) -> None:
+    """Refuse images that show no valid ground at all. areas : m2, of each. Raises GeometryError."""
+    if not any(areas):
+        raise GeometryError(
+            f"{images}: expected valid ground under some image, found none: pixels of images and elevations are nodata "
+            "wherever both lie; check nodata values and georeferences."
+        )
 
 
 def _write_grid(writer: ArtefactWriter, grid: Grid) -> None:

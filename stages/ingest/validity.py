@@ -1,4 +1,4 @@
-"""Masks of the ground that each image shows, and of the places where its crops may be centred."""
+"""Masks of the ground that each image shows."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from stages.physics.images.source_images import open_source
 from stages.physics.images.table import Frame
 from stages.physics.images.table_checks import check_emission
 from stages.physics.maps.grid import Grid
-from stages.physics.maps.positions import blocks, valid_positions
+from stages.physics.maps.positions import blocks
 
 
 def check_frames(
@@ -57,8 +57,8 @@ def write_validity(
     config: Config,
     progress: Progress,
 ) -> float:
-    """Write the masks of the image with this index; returns the ground area of its valid positions, m2."""
-    valid, position = writer.dataset("valid"), writer.dataset("valid_position")
+    """Write the mask of the image with this index; returns the valid ground that it shows, m2."""
+    valid, area = writer.dataset("valid"), 0.0
     dem_valid = dem["dem_valid"]
     with open_source(frame, grid, dem["elevation"], heights) as source:
         row0, col0, height, width = source.box() or (0, 0, 0, 0)
@@ -72,20 +72,14 @@ def write_validity(
                 valid[(index, *part)] = seen
                 rows[r : r + h] |= seen.any(axis=1)
                 cols[c : c + w] |= seen.any(axis=0)
+                middle = row0 + r + h / 2, col0 + c + w / 2
+                area += float(seen.sum()) * float(np.prod(grid.local_frames(*middle).pixel_size[0]))
     if not rows.any():
         writer.dataset("frame_window")[index] = (row0, col0, 0, 0)
         return 0.0
     r0, r1 = row0 + int(rows.argmax()), row0 + height - int(rows[::-1].argmax())
     c0, c1 = col0 + int(cols.argmax()), col0 + width - int(cols[::-1].argmax())
     writer.dataset("frame_window")[index] = (r0, c0, r1 - r0, c1 - c0)
-    area = 0.0
-    for r, c, h, w in blocks(r1 - r0, c1 - c0, config.block):
-        r, c = r0 + r, c0 + c
-        eroded = valid_positions(valid[index], grid.height, grid.width, (r, c, h, w), config.crop)
-        if eroded.any():
-            position[index, r : r + h, c : c + w] = eroded
-            pixel = grid.local_frames(r + h / 2, c + w / 2).pixel_size[0]
-            area += float(eroded.sum()) * float(pixel[0] * pixel[1])
     _check_sun(frame, grid, (r0 + r1) / 2, (c0 + c1) / 2)
     if frame.angles is not None:
         angle_bands(frame.angles)

@@ -63,7 +63,7 @@ def scene(file: h5py.File) -> page.Section:
         )
     ]
     header = ["image", "time (UTC)", "units", "sub-solar lon, deg", "sub-solar lat, deg", "altitude, km"]
-    section.add(page.table("Images", [*header, "crops fit on, km2"], rows))
+    section.add(page.table("Images", [*header, "valid ground, km2"], rows))
     return section
 
 

@@ -58,9 +58,7 @@ def work(scene: Path, output: Output, config: Config, progress: Progress) -> lis
         rng = np.random.default_rng(config.seed)
         chosen = choose_places(positions, tiles, len(opened.frames), grid, config, rng, progress)
         if not len(chosen):
-            raise GeometryError(
-                f"{scene}: no crop of {crop} px fits into a tile of {edge * grid.gsd:g} m and valid data; choose a smaller `crop` or other `tile_m`."
-            )
+            raise _no_crop_fits(scene, positions, edge)
         parts = audit(chosen, tiles, grid, crop)
         _write(opened, output, chosen, tiles, parts, config)
     return parts
@@ -98,6 +96,21 @@ def _read(path: Path, file: h5py.File, config: Config) -> Scene:
     if not frames:
         raise ConfigError(f"{path}: expected images, found none; run 'lunargr ingest' with `images`.")
     return Scene(path, grid, frames, crop)
+
+
+def _no_crop_fits(scene: Path, positions: PositionMasks, edge: int) -> GeometryError:
+    """What to do where no crop lies on valid ground, or none in a tile of ``edge`` px."""
+    crop, gsd, side = positions.crop, positions.grid.gsd, positions.largest_square()
+    if side >= crop:
+        return GeometryError(
+            f"{scene}: no crop of {crop} px fits into a tile of {edge * gsd:g} m and valid data; choose a smaller `crop` or other `tile_m`."
+        )
+    smaller = f"choose a `crop` of at most {side // 16 * 16} px, or " if side >= 16 else ""
+    return GeometryError(
+        f"{scene}: a crop of {crop} px ({crop * gsd:g} m) is larger than any valid region of any image, where {side * gsd:g} m "
+        f"({side} px) fit; {smaller}take a grid of {max(side, 1) * gsd / crop:.3g} m or finer (`gsd` of 'lunargr ingest'), from a DEM "
+        "that is as fine."
+    )
 
 
 def _write(

@@ -32,11 +32,6 @@ class Form:
     terms: int
     leaning: bool = False
 
-    @property
-    def upright(self) -> Form:
-        """The same without relief displacement."""
-        return next(f for f in PLAIN if f.terms == self.terms)
-
 
 PLAIN = (Form("none", 0), Form("constant", 1), Form("affine", 3), Form("field", len(TERMS)))
 LEANING = tuple(

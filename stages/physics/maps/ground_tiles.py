@@ -11,6 +11,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import h5py
 import numpy as np
 from geographiclib.geodesic import Geodesic
@@ -65,7 +66,6 @@ class PositionMasks:
     def __init__(self, file: h5py.File, grid: Grid, crop: int, block: int) -> None:
         self.file, self.grid, self.crop = file, grid, crop
         self.scene_crop = int(file.attrs["crop_px"])
-        self.stored = self.scene_crop == crop
         self.windows = file["frame_window"][...]
         self.blocks = list(blocks(grid.height, grid.width, block))
 
@@ -76,13 +76,21 @@ class PositionMasks:
         meets = (fh > 0) & (r < row + h) & (r + fh > row) & (c < col + w) & (c + fw > col)
         return [int(k) for k in np.flatnonzero(meets)]
 
-    def mask(self, frame: int, block: tuple[int, int, int, int]) -> NDArray[np.bool_]:
-        """(height, width) bool: where a crop of an image may be centred; block : row, column, height, width."""
-        row, col, h, w = block
-        if self.stored:
-            return self.file["valid_position"][frame, row : row + h, col : col + w].astype(bool)
+    def mask(self, frame: int, block: tuple[int, int, int, int], crop: int | None = None) -> NDArray[np.bool_]:
+        """(height, width) bool: where a crop of an image may be centred; block : row, column, height, width; crop : px"""
         # Two-dimensional view of one frame, sliced lazily.
-        return valid_positions(_Layer(self.file["valid"], frame), self.grid.height, self.grid.width, block, self.crop)
+        layer = _Layer(self.file["valid"], frame)
+        return valid_positions(layer, self.grid.height, self.grid.width, block, crop or self.crop)
+
+    def largest_square(self) -> int:
+        """px, side of the largest square of valid ground that an image shows, of those smaller than a crop."""
+        largest = 0
+        for k, (row, col, height, width) in enumerate(self.windows.tolist()):
+            for top in range(row, row + height, 4 * self.crop):
+                strip = self.file["valid"][k, top : min(top + 5 * self.crop, row + height), col : col + width]
+                reach = cv2.distanceTransform(np.pad(strip, 1), cv2.DIST_C, 3).max(initial=0)
+                largest = max(largest, 2 * int(reach) - 1)
+        return largest
 
 
 class _Layer:
@@ -153,7 +161,7 @@ def split_tiles(
         covered, centres = np.zeros((h, w), bool), np.zeros((h, w), bool)
         for frame in positions.frames_of(block):
             covered |= positions.file["valid"][frame, *part_of_scene].astype(bool)
-            centres |= positions.file["valid_position"][frame, *part_of_scene].astype(bool)
+            centres |= positions.mask(frame, block, positions.scene_crop)
         r, c = np.nonzero(covered)
         np.add.at(ground, ((r + row) // edge, (c + col) // edge), 1)
         r, c = (v + first for v, first in zip(np.nonzero(centres), (row, col), strict=True))
