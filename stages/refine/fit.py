@@ -15,14 +15,15 @@ ROUNDS = 3
 
 
 def fit(
-    patch: Patch, fields: Floats32, priors: Priors, noise: Noise, only: Collection[int] | None = None,
+    patch: Patch, start: Floats32, priors: Priors, noise: Noise, only: Collection[int] | None = None,
 ) -> tuple[Floats32, Posterior, Evidence]:  # fmt: skip
-    """(2, H, W) posterior mean of heights and log albedo, from ``fields`` on. only : images that count, None for all
+    """(2, H, W) posterior mean of heights and log albedo, from ``start`` on: see ``Patch.start``. only : images that count, None for all
 
     Heights without variance stay, and with them slopes and shadows: one round, with the weights of its start.
     """
+    fields = start
     for number in range(ROUNDS if priors.heights.variance.any() else 1):
-        evidence = patch.evidence(fields, noise, only, relinearise=number == 1)
+        evidence = patch.evidence(fields, start, noise, only, relinearise=number == 1)
         posterior = Posterior(evidence.products, patch.px, priors)
         fields = posterior.mean(evidence.gradient, fields, number > 0)
         if number == 0:

@@ -1,7 +1,8 @@
 """Whether heights help: images left out in turn, predicted by the others with and without them, on the same windows.
 
 Without them: the same posterior with the DEM's heights, and the map of ``lunargr albedo``. Squared errors are compared
-window by window; the correction counts if the 95 % intervals of its gain over both lie above zero.
+window by window, each with the image's best gain there: its level is the reflectance's and tells nothing of heights. The
+correction counts if the 95 % intervals of its gain over both lie above zero.
 """
 
 from __future__ import annotations
@@ -14,14 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.common.arrays import Floats32
+from stages.common.arrays import Floats32, Mask
 from stages.common.intervals import gain_interval
 from stages.common.progress import Progress, show_nothing
 from stages.photographs.calibrate import COSINES, Calibration
 from stages.photographs.ground import Ground
 from stages.photographs.intervals import unseen_widths
-from stages.photographs.posterior import estimate, robust_mean
-from stages.photographs.prior import terrain_variance
 from stages.physics.images.spectrum import WAVELENGTHS, Spectrum, by_wavelength, waves
 from stages.physics.images.windows import WINDOW_PX, choose_windows
 from stages.physics.maps.window import Box, Window
@@ -182,9 +181,8 @@ def _score(
     priors, noise = learned
     patch.refresh(None)
     start = patch.start(used)
-    alone = np.stack([start[0], _shared_albedo(ground, calibration, patch, used)])
     held, _, _ = fit(patch, start, replace(priors, heights=Spectrum(np.zeros(len(WAVELENGTHS)))), noise, used)
-    without = [[patch.predict(p, fields).image for fields in (held, alone)] for p in tested]
+    without = [[patch.predict(p, fields).image for fields in (held, start)] for p in tested]
     fields, posterior, evidence = fit(patch, start, priors, noise, used)
     rng = np.random.default_rng([SEED, *window[:2], min(left)])
     mean, draw, noise_alone = (waves(x) for x in (fields, posterior.draw(rng), posterior.draw(rng, prior=False)))
@@ -200,7 +198,7 @@ def _score(
         values[:, *p.box.within(patch.box).part] = measured, after.image, *before, after.cosine, after.shadow
         # one image tells neither heights nor albedo
         known = np.isfinite(values).all(axis=0) & (quarter >= 0) & (others > 1)
-        errors = (values[1:4] - values[0]) ** 2
+        errors = _squares(values[0], values[1:4], known)
         for k in np.unique(quarter[known]):
             here = errors[:, known & (quarter == k)].sum(axis=1, dtype=float)
             for sums, value in zip((scores.refined, scores.held, scores.albedo), here, strict=True):
@@ -209,11 +207,18 @@ def _score(
         place = np.clip(np.digitize(values[4], COSINES) - 1, 0, len(COSINES) - 2)
         place[values[5] > SHADOWED] = len(COSINES) - 1
         at = np.flatnonzero(known)[::THINNED]
-        residual, image, bins = (v.ravel()[at] for v in (np.sqrt(errors[0]), values[1], place))
+        residual, image, bins = (v.ravel()[at] for v in (np.abs(values[1] - values[0]), values[1], place))
         least = max(p.sun_sine(ground.references.surface.grid), 1e-3)
         turn.judged.append(Judged(p.k, at, residual, image, bins, least))
     patch.refresh(None)
     return [turn]
+
+
+def _squares(measured: Floats32, predicted: Floats32, known: Mask) -> Floats32:
+    """(n, H, W) squared errors of ``predicted``, each times the gain that fits (H, W) ``measured`` best where ``known``."""
+    own = predicted[:, known]
+    gain = own @ measured[known] / np.maximum(np.square(own).sum(axis=1), 1e-30)
+    return np.asarray((gain[:, None, None] * predicted - measured) ** 2, np.float32)
 
 
 def _quarters(patch: Patch, window: Box) -> NDArray[np.int8]:
@@ -223,14 +228,6 @@ def _quarters(patch: Patch, window: Box) -> NDArray[np.int8]:
     rows, cols = np.indices((judged.height, judged.width))
     found[judged.part] = 2 * (rows >= WINDOW_PX // 2) + (cols >= WINDOW_PX // 2)
     return found
-
-
-def _shared_albedo(ground: Ground, calibration: Calibration, patch: Patch, used: Sequence[int]) -> Floats32:
-    """(H, W) log albedo of ``lunargr albedo`` from the images used."""
-    ratio, confidence, images = patch.ratios(used)
-    spread = calibration.spread.of(images)
-    robust_mean(ratio, confidence, spread)
-    return estimate(ratio, confidence, spread, terrain_variance(ground.surface, patch.box))[0]
 
 
 def _decide(scores: Scores, windows: int) -> tuple[tuple[float, float, float], str]:

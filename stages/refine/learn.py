@@ -64,7 +64,8 @@ def learn(
     priors, noise : where to start; heights of no variance stay what the DEM says
     """
     rng = np.random.default_rng(SEED)
-    fields = [patch.start() for patch in patches]
+    starts = [patch.start() for patch in patches]
+    fields = list(starts)
     heights = bool(priors.heights.variance.any())
     for number in range(ROUNDS):
         sums, seen = Sums(), Seen(len(noise.absolute))
@@ -72,7 +73,7 @@ def learn(
             progress(number * len(patches) + k, ROUNDS * len(patches), "spectra, windows")
             if heights and number in REFRESHED:
                 patch.refresh(fields[k][0])
-            evidence = patch.evidence(fields[k], noise, relinearise=number in REFRESHED)
+            evidence = patch.evidence(fields[k], starts[k], noise, relinearise=number in REFRESHED)
             posterior = Posterior(evidence.products, patch.px, priors)
             found = posterior.mean(evidence.gradient, fields[k], number > 0)
             sums.add(posterior, evidence.gradient, fields[k], found, posterior.draw(rng))

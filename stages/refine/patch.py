@@ -15,7 +15,8 @@ import torch
 from stages.common.arrays import Floats, Floats32, Mask
 from stages.photographs.calibrate import Calibration
 from stages.photographs.ground import Ground
-from stages.photographs.posterior import robust_mean
+from stages.photographs.posterior import estimate, robust_mean
+from stages.photographs.prior import terrain_variance
 from stages.physics.formation.geometry import photometric_angles
 from stages.physics.images.references import Observed, References, SceneHorizon, far_from_shadow
 from stages.physics.maps.grid import Grid
@@ -173,24 +174,29 @@ class Patch:
         return ratio, confidence, [p.k for p in mine]
 
     def start(self, only: Collection[int] | None = None) -> Floats32:
-        """(2, H, W): heights of the DEM, and the log albedo that images agree on pixel by pixel. only : see :meth:`ratios`"""
+        """(2, H, W): heights of the DEM, and the log albedo of ``lunargr albedo``. only : see :meth:`ratios`"""
         fields = np.zeros((2, *self.shape), np.float32)
         ratio, confidence, images = self.ratios(only)
         if images:
-            fields[1] = robust_mean(ratio, confidence, self._calibration.spread.of(images))
+            spread = self._calibration.spread.of(images)
+            robust_mean(ratio, confidence, spread)
+            fields[1] = estimate(ratio, confidence, spread, terrain_variance(self._surface, self.box))[0]
         return fields
 
     def evidence(
-        self, fields: Floats32, noise: Noise, only: Collection[int] | None = None, relinearise: bool = False
-    ) -> Evidence:
-        """What the images say about ``fields`` (2, H, W): see ``solve``. only : images that count, None for all"""
+        self, fields: Floats32, start: Floats32, noise: Noise, only: Collection[int] | None = None, relinearise: bool = False,
+    ) -> Evidence:  # fmt: skip
+        """What the images say about ``fields`` (2, H, W), beside what is broad: see ``solve``.
+
+        start : of these images, whose broad albedo holds; only : images that count, None for all
+        """
         evidence, gradient = np.zeros((6, *self.shape), np.float32), np.zeros((3, *self.shape), np.float32)
         seen = [
             _residual(p, self.predict(p, fields, relinearise), noise, p.box.within(self.box))
             for p in self.photographs
             if only is None or p.k in only
         ]
-        doubt = _agree(seen, self.shape)
+        doubt = _level(seen, start[1] - fields[1])
         for r in seen:
             found, inner = r.predicted, r.box.part
             _add(evidence[:, *inner], gradient[:, *inner], found.image, r.relative, found.east, found.north, r.variance)
@@ -235,33 +241,29 @@ def _residual(photograph: Photograph, predicted: Predicted, noise: Noise, box: W
     return Residual(photograph.k, box, predicted, relative, variance, np.zeros_like(image))
 
 
-def _agree(seen: Sequence[Residual], shape: tuple[int, int]) -> Floats32:
-    """Take off each image the broad residual by which it differs from the mean of all, in place; (H, W) variance of another image's broad difference from that mean.
+def _level(seen: Sequence[Residual], wanted: Floats32) -> Floats32:
+    """Bring the broad residual of each image to that of ``wanted`` (H, W), in place; (H, W) variance of another image's broad difference from it.
 
     Laws and calibrations err broadly, by much more than white noise of single pixels would; the DEM knows broad relief.
     """
-    total, weight, square, spread = np.zeros((4, *shape), np.float32)
-    parts = []
+    weight, square, spread = np.zeros((3, *wanted.shape), np.float32)
+    level = broadly(wanted) / broadly(np.ones_like(wanted))
     for r in seen:
         trust = _trust(r) * np.divide(
             r.predicted.image**2, r.variance, out=np.zeros_like(r.variance), where=r.variance > 0
         )
         below, above = broadly(trust), broadly(trust * r.relative)
         r.broad = np.divide(above, below, out=np.zeros_like(above), where=below > 1e-3 * below.max(initial=0))
-        total[r.box.part] += below * r.broad
-        weight[r.box.part] += below
-        parts.append(below)
-    mean = np.divide(total, weight, out=np.zeros_like(total), where=weight > 0)
-    for r, below in zip(seen, parts, strict=True):
-        r.broad -= mean[r.box.part]
+        r.broad -= np.where(below > 0, level[r.box.part], 0)
         r.relative -= np.where(r.variance > 0, r.broad, 0)
         _raise_variance(r)
+        weight[r.box.part] += below
         square[r.box.part] += below * r.broad**2
         spread[r.box.part] += below**2
-    # of images of equal weight: the mean square times n / (n - 1), and as much by n for their mean
+    # of n images of equal weight: the mean square times n / (n - 1), and as much by n for their mean
     share = np.divide(spread, weight**2, out=np.ones_like(weight), where=weight > 0)
     scatter = np.divide(square, weight, out=np.zeros_like(weight), where=weight > 0)
-    return scatter * (1 + share) / np.maximum(1 - share, 0.1)
+    return scatter * (1 + share) / np.maximum(1 - share, 0.5)
 
 
 def _trust(r: Residual) -> Floats32:

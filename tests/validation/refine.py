@@ -1,6 +1,6 @@
 """How well `lunargr refine` finds relief that a DEM lacks: simulated scenes with known heights, each through the whole pipeline.
 
-    python tests/validation/refine.py --output results/refine [--case smooth --case smooth:4] [--size 512]
+    python tests/validation/refine.py --output results/refine [--case smooth --case smooth:4] [--size 512] [--seed 1 --seed 7]
 
 A third of twelve images is left out of the albedo and of the heights; the other eight, or as many of them as
 a case names, make them. Every figure is written to
@@ -15,6 +15,7 @@ import csv
 import json
 import subprocess
 import sys
+from itertools import product
 from pathlib import Path
 
 import h5py
@@ -32,6 +33,7 @@ CASES = {
     "complete": "none",  # the DEM lacks nothing but 5 cm of white noise; all that the map lacks is albedo
 }
 USED = 8  # of twelve images
+SEEDS = (1, 7)  # 1 was looked at when `refine` was made, 7 was drawn afterwards
 ROWS = (*CASES, "smooth:4")
 BANDS = ((3, 8), (8, 16), (16, 64))  # px
 WEIGHTS = (1e-4, 1e-3, 1e-2, 1e-1)
@@ -41,12 +43,12 @@ def run(*words: object) -> None:
     subprocess.run([sys.executable, "-m", "lunargr_cli.main", *map(str, words), "--quiet"], check=True, cwd=ROOT)
 
 
-def make(folder: Path, case: str, size: int, images: int) -> None:
+def make(folder: Path, case: str, size: int, images: int, seed: int) -> None:
     """The chain of commands up to the scores; what is there is not made again."""
     f = {n: folder / n for n in ("scene", "scene.h5", "crops.h5", "pairs.h5", "checkpoint.h5", "svbrdf.h5")}
     albedo, refined = folder / f"albedo_{images}.h5", folder / f"refined_{images}.h5"
     if not f["scene"].exists():
-        run("simulate", "-o", f["scene"], "--size-px", size, "--images", 12, "--hidden", CASES[case])
+        run("simulate", "-o", f["scene"], "--size-px", size, "--images", 12, "--hidden", CASES[case], "--seed", seed)
         if case == "reduced":
             reduce(f["scene"] / "dem.tif", 4)
     with open(f["scene"] / "images.csv") as stream:
@@ -123,7 +125,8 @@ def score(folder: Path, case: str, used: int) -> dict[str, object]:
     row["albedo_error_alone"] = round(float(np.std((np.log(alone) - ratio)[seen])), 4)
     with open(folder / f"held_out_{used}.json") as stream:
         result = json.load(stream)
-    mse = {n: result["models"][n]["mse"] for n in ("terrain", "albedo", "refined")}
+    models = ("terrain", "albedo", "refined", "albedo_gain_offset", "refined_gain_offset")
+    mse = {n: result["models"][n]["mse"] for n in models}
     row |= {f"mse_{n}": f"{v:.4g}" for n, v in mse.items()}
     row["mse_percent"] = round(100 * (mse["refined"] / mse["albedo"] - 1), 1)
     found = result["gains"]["refined"]["albedo"]
@@ -238,17 +241,18 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=ROOT / "results/refine")
     parser.add_argument("--case", choices=ROWS, action="append", help="and the number of images that make the heights")
     parser.add_argument("--size", type=int, default=512)
+    parser.add_argument("--seed", type=int, action="append", help="of the scenes")
     parser.add_argument("--docs", type=Path, help="CSV to write the rows into")
     options = parser.parse_args()
     rows = []
-    for row in options.case or ROWS:
+    for row, seed in product(options.case or ROWS, options.seed or SEEDS):
         case, _, number = row.partition(":")
         images = int(number or USED)
-        folder = (options.output / case).resolve()
+        folder = (options.output / f"{case}_{seed}").resolve()
         folder.mkdir(parents=True, exist_ok=True)
-        make(folder, case, options.size, images)
+        make(folder, case, options.size, images, seed)
         beside = photoclinometry(folder) if case != "complete" and images == USED else {}
-        rows.append(score(folder, case, images) | beside)
+        rows.append({"seed": seed} | score(folder, case, images) | beside)
         print(json.dumps(rows[-1], indent=1), flush=True)
     if options.docs:
         columns = list(dict.fromkeys(name for row in rows for name in row))
