@@ -15,6 +15,7 @@ from refine_scene import axes, missing_waves, photographs
 from schemas import ArtefactError, ConfigError
 from schemas.files.outputs import Output
 from stages import albedo, merge, refine
+from stages.physics.maps.window import Window
 
 QUIET = refine.Config(geotiff=False)
 INNER = np.s_[12:-12, 12:-12]
@@ -112,6 +113,20 @@ def test_a_dem_that_lacks_nothing_stays_within_its_error_bars_and_albedo_does_no
     east = (correction[:, 2:] - correction[:, :-2])[INNER] / 40.0
     # shading of a Sun at 45 degrees changes by as much as the slope, relative to its brightness
     assert rms(east) < 0.1 * rms(np.log(complete.albedo)[INNER])
+
+
+def test_levels_of_images_leave_no_step_where_one_ends():
+    from stages.refine.patch import Predicted, Residual, _level
+
+    def residual(k, width, level):
+        one, none = np.ones((64, width), np.float32), np.zeros((64, width), np.float32)
+        predicted = Predicted(one, none, none, one > 0, one, none)
+        return Residual(k, Window(0, 0, 64, width), predicted, level * one, 1e-4 * one)
+
+    seen = [residual(0, 64, 0.1), residual(1, 32, -0.1)]
+    _level(seen, np.zeros((64, 64), np.float32))
+    for r in seen:
+        np.testing.assert_allclose(r.relative, 0, atol=1e-4)
 
 
 @pytest.mark.parametrize("count", [1, 2])

@@ -69,7 +69,10 @@ _REFINED = (
     _refined_column("wavelength", "refine_albedo_wave_std", "1", f"std of log albedo, {_WAVE}"),
     _refined_column("wavelength", "refine_trust", "1", "share of white noise's weight that images keep"),
     _refined_column(
-        "bound", "refine_gain_percent", "percent", "by which squared errors of images left out fall; value, low, high"
+        "bound",
+        "refine_gain_percent",
+        "percent",
+        "by which squared errors of images left out fall, each at its best gain; value, low, high",
     ),
 )
 

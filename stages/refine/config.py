@@ -18,7 +18,7 @@ class Config:
 class Summary:
     """For the lines at the end. reason : why the DEM came back as it was, empty where it was corrected
 
-    gain : percent by which the squared error of images left out falls, and its 95 % interval
+    gain : percent by which the squared error of images left out, each at its best gain, falls, and its 95 % interval
     correction, correction_std : m, rms and median; waves : px, std of a wave's height in m, of log albedo, share of the
     images' weight that is left
     """

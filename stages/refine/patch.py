@@ -158,29 +158,21 @@ class Patch:
             east, north = np.where(usable, photograph.changes / lit, 0).astype(np.float32)
         return Predicted(image.astype(np.float32), east, north, usable, cosine, shadow)
 
-    def ratios(self, only: Collection[int] | None = None) -> tuple[Floats32, Floats32, list[int]]:
-        """(n, H, W) log ratios to the map without heights and albedo, their confidence, and the images: see ``Calibration.ratio``.
-
-        only : images that count, None for all
-        """
+    def start(self, only: Collection[int] | None = None) -> Floats32:
+        """(2, H, W): heights of the DEM, and the log albedo of ``lunargr albedo``. only : images that count, None for all"""
         mine = [p for p in self.photographs if only is None or p.k in only]
-        none = np.zeros((2, *self.shape), np.float32)
+        fields = np.zeros((2, *self.shape), np.float32)
+        if not mine:
+            return fields
         ratio, confidence = np.zeros((2, len(mine), *self.shape), np.float32)
         for n, p in enumerate(mine):
-            found, inner = self.predict(p, none), p.box.within(self.box).part
+            found, inner = self.predict(p, fields), p.box.within(self.box).part
             measured = self._calibration.gain[p.k] * p.measured + self._calibration.offset[p.k]
             observed = Observed(measured, found.image, found.cosine, found.usable, found.shadow > SHADOWED, 0.0)
             ratio[n][inner], confidence[n][inner] = self._calibration.ratio(p.k, observed)
-        return ratio, confidence, [p.k for p in mine]
-
-    def start(self, only: Collection[int] | None = None) -> Floats32:
-        """(2, H, W): heights of the DEM, and the log albedo of ``lunargr albedo``. only : see :meth:`ratios`"""
-        fields = np.zeros((2, *self.shape), np.float32)
-        ratio, confidence, images = self.ratios(only)
-        if images:
-            spread = self._calibration.spread.of(images)
-            robust_mean(ratio, confidence, spread)
-            fields[1] = estimate(ratio, confidence, spread, terrain_variance(self._surface, self.box))[0]
+        spread = self._calibration.spread.of([p.k for p in mine])
+        robust_mean(ratio, confidence, spread)
+        fields[1] = estimate(ratio, confidence, spread, terrain_variance(self._surface, self.box))[0]
         return fields
 
     def evidence(
@@ -210,7 +202,7 @@ class Patch:
 class Evidence:
     """What images say of a window. products : (6, H, W) sums of w j j'; gradient : (3, H, W) sums of w j times the residual
 
-    doubt : (H, W) variance of log albedo for an image under other angles, from how the broad residuals of these differ
+    doubt : (H, W) variance of log albedo for an image under other angles, from the broad residuals of these
     """
 
     products: Floats32
@@ -223,7 +215,7 @@ class Evidence:
 class Residual:
     """What a photograph shows beyond the map. box : within the window; relative : (h, w) to the predicted I/F, 0 where not usable
 
-    variance : (h, w) I/F^2, 0 where not usable; broad : (h, w) of the residual, by which the image differs from the others
+    variance : (h, w) I/F^2, 0 where not usable
     """
 
     k: int
@@ -231,14 +223,13 @@ class Residual:
     predicted: Predicted
     relative: Floats32
     variance: Floats32
-    broad: Floats32
 
 
 def _residual(photograph: Photograph, predicted: Predicted, noise: Noise, box: Window) -> Residual:
     usable, image = predicted.usable, predicted.image
     relative = np.divide(photograph.measured - image, image, out=np.zeros_like(image), where=usable)
     variance = np.where(usable, noise.of(photograph.k, image), 0).astype(np.float32)
-    return Residual(photograph.k, box, predicted, relative, variance, np.zeros_like(image))
+    return Residual(photograph.k, box, predicted, relative, variance)
 
 
 def _level(seen: Sequence[Residual], wanted: Floats32) -> Floats32:
@@ -253,12 +244,12 @@ def _level(seen: Sequence[Residual], wanted: Floats32) -> Floats32:
             r.predicted.image**2, r.variance, out=np.zeros_like(r.variance), where=r.variance > 0
         )
         below, above = broadly(trust), broadly(trust * r.relative)
-        r.broad = np.divide(above, below, out=np.zeros_like(above), where=below > 1e-3 * below.max(initial=0))
-        r.broad -= np.where(below > 0, level[r.box.part], 0)
-        r.relative -= np.where(r.variance > 0, r.broad, 0)
+        here = below > 1e-3 * below.max(initial=0)
+        broad = np.divide(above, below, out=np.zeros_like(above), where=here) - np.where(here, level[r.box.part], 0)
+        r.relative -= np.where(r.variance > 0, broad, 0)
         _raise_variance(r)
         weight[r.box.part] += below
-        square[r.box.part] += below * r.broad**2
+        square[r.box.part] += below * broad**2
         spread[r.box.part] += below**2
     # of n images of equal weight: the mean square times n / (n - 1), and as much by n for their mean
     share = np.divide(spread, weight**2, out=np.ones_like(weight), where=weight > 0)

@@ -344,11 +344,18 @@ STAGES = (
         "directions of any length are taken",
     ),
     Mutant(
-        "schemas/reading.py",
-        "result = (values * scale + offset).astype(np.float32)",
-        "result = (values * scale).astype(np.float32)",
+        "schemas/packing.py",
+        "            result += offset\n",
+        "",
         ("tests/test_schemas.py::test_packed_numbers_are_scaled_and_moved",),
         "add_offset of packed numbers is ignored",
+    ),
+    Mutant(
+        "stages/refine/patch.py",
+        "r.relative -= np.where(r.variance > 0, broad, 0)",
+        "r.relative -= broad.mean()",
+        ("tests/test_refine.py::test_levels_of_images_leave_no_step_where_one_ends",),
+        "levels of images become albedo",
     ),
     Mutant(
         "stages/photographs/posterior.py",
