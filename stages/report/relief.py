@@ -65,7 +65,7 @@ def _lit(elevation: np.ndarray) -> np.ndarray:
 
 
 def _spectrum(file: h5py.File, change: np.ndarray) -> str:
-    """What the DEM lacks as the photographs tell, what was added here, and what may still be wrong."""
+    """What the DEM lacks as the photographs tell, and what was added here."""
     known = np.isfinite(change)
     count = by_wavelength(np.ones(change.shape, np.float32))
     length = file["refine_wavelength_px"][...]
@@ -74,5 +74,8 @@ def _spectrum(file: h5py.File, change: np.ndarray) -> str:
     axes.plot(length, file["refine_elevation_wave_std"][...], "o-", color="#c08a2e", label="what the DEM lacks")
     axes.plot(length, found, "o-", color="#3b8ecb", label="correction")
     axes.set(xscale="log", yscale="log", xlabel="wavelength, px", ylabel="m")
+    ticks = 2 ** np.arange(1, 7)
+    axes.set_xticks(ticks, [str(t) for t in ticks])
+    axes.tick_params(axis="x", which="minor", bottom=False, labelbottom=False)
     axes.legend(frameon=False, fontsize=8, labelcolor=pictures.INK)
     return pictures.chart_svg(figure, "relief")
