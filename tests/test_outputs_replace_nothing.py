@@ -208,6 +208,19 @@ def test_an_output_that_nobody_declared_cannot_replace_anything(tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["other", "source"]
 
 
+def test_an_output_that_exists_is_refused_before_the_work(tmp_path):
+    @runner.stage()
+    def run(source: Path, output: Output | Path, config: None) -> None:
+        raise AssertionError("worked for nothing")
+
+    for name in ("source", "output"):
+        (tmp_path / name).write_text("kept")
+    with pytest.raises(ConfigError, match="exists already"):
+        run(tmp_path / "source", tmp_path / "output", None)
+    with pytest.raises(AssertionError, match="worked"):
+        run(tmp_path / "source", Output(tmp_path / "output", overwrite=True), None)
+
+
 LONG = "n" * 300
 
 

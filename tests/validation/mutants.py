@@ -76,6 +76,8 @@ def main() -> int:
     parser.add_argument("--list", action="store_true", help="print the bugs and check that their texts are there")
     options = parser.parse_args()
     chosen = [m for m in MUTANTS if options.only in m.file or options.only in m.bug]
+    if not chosen:
+        parser.error(f"--only: no bug holds '{options.only}' in its file or description")
     noticed, broken = 0, 0
     with tempfile.TemporaryDirectory() as name:
         tree = Path(name) / "tree"
@@ -100,7 +102,7 @@ def main() -> int:
             )
     if options.list:
         return 1 if broken else 0
-    share = noticed / max(len(chosen), 1)
+    share = noticed / len(chosen)
     print(
         f"{noticed} of {len(chosen)} planted bugs caught ({100 * share:.0f} %, at least {100 * ENOUGH:.0f} % expected)"
     )
