@@ -31,9 +31,8 @@ def command(
     json_file: Json = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Show what a file holds.
-
-    An artefact: its variables, and what made it. A DEM, image or camera: size, ground, time and Sun, and how fine a DEM it needs.
+    """Show what a file holds. An artefact: its variables, and the commands and inputs that made it. A DEM, an image or a
+    camera: its size, ground, time and Sun, and how fine a DEM it needs.
     """
     with prepared([file], json_targets(json_file), overwrite):
         _inspect(file, json_file)
